@@ -1,7 +1,7 @@
-"""Measured deformation: MR images, alignment on bone, B-spline registration, strain, and how far to trust it.
+"""Measured deformation: MR images, alignment on bone, B-spline registration, strain, verdict and uncertainty.
 
-The public surface; a name is loaded when it is first used. All geometry is LPS mm in the reference (unloaded)
-configuration unless a docstring says otherwise. Where to start:
+The public interface; each name is loaded when it is first used. All geometry is LPS mm in the reference (unloaded)
+configuration unless a docstring states otherwise. Where to start:
 
     import dvc
 

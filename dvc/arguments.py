@@ -22,24 +22,24 @@ _WANTED = {
     "float": "a number",
     "Callable": "a function",
     "Criteria": "a validate.Criteria, such as validate.Criteria(strains=(0.2, 0.5))",
-    "Deformation": "a deformation, as dvc.read_displacement(file) and dvc.register give it",
-    "ErrorModel": "a dvc.ErrorModel, as dvc.read_error_model(file) gives it",
+    "Deformation": "a deformation, from dvc.read_displacement(file) or dvc.register",
+    "ErrorModel": "a dvc.ErrorModel, from dvc.read_error_model(file)",
     "ErrorTable": "a dvc.ErrorTable, one of dvc.read_error_model(file).tables",
     "FeResult": "a validate.FeResult: read_result(name, file) or FeResult.of(name, simulation.deformation(load))",
     "Grid": "a dvc.Grid, such as that of an image (image.grid)",
-    "Image": "a dvc.Image: dvc.read_image(file), or dvc.Image(grid, values) of an array on a dvc.Grid",
-    "LabelMap": "a dvc.LabelMap: dvc.read_labels(file, names), or dvc.LabelMap(grid, labels, {1: 'fat'}) of an array",
+    "Image": "a dvc.Image, from dvc.read_image(file), or dvc.Image(grid, values) for an array on a dvc.Grid",
+    "LabelMap": "a dvc.LabelMap, from dvc.read_labels(file, names), or dvc.LabelMap(grid, labels, {1: 'fat'})",
     "LoadCase": "a validate.LoadCase: LoadCase.of(load, measured, results)",
     "LoadStep": "a fe.LoadStep, such as fe.LoadStep('Load1', normal_n=15.0)",
-    "Mask": "a dvc.Mask: dvc.read_mask(file), or dvc.Mask(grid, inside) of an array on a dvc.Grid",
-    "Measurement": "a dvc.Measurement, as dvc.measure gives it",
+    "Mask": "a dvc.Mask, from dvc.read_mask(file), or dvc.Mask(grid, inside) for an array on a dvc.Grid",
+    "Measurement": "a dvc.Measurement, from dvc.measure",
     "Material": "a material, such as fe.Ogden.from_abaqus(mu_mpa, alpha)",
-    "MaterialSet": "a set of materials, as fe.material_set(name or file) gives it",
-    "MeshFile": "a dvc.MeshFile, as dvc.read_mesh(file) gives it",
-    "OnMesh": "the deformation of a mesh, as simulation.deformation('Load1') of a fe.Simulation",
+    "MaterialSet": "a material set, from fe.material_set(name or file)",
+    "MeshFile": "a dvc.MeshFile, from dvc.read_mesh(file)",
+    "OnMesh": "the deformation of a mesh, from simulation.deformation('Load1') of a fe.Simulation",
     "Plate": "a fe.Plate, such as fe.Plate(normal=(0, 0, -1), shear=(0, -1, 0))",
     "Settings": "a dvc.Settings, such as dvc.Settings(dvc.GaussNewton(), threads=2)",
-    "TetMesh": "a TetMesh, as fe.read_tet_mesh(file) and fe.mesh_labels give it",
+    "TetMesh": "a TetMesh, from fe.read_tet_mesh(file) or fe.mesh_labels",
 }
 
 
@@ -121,12 +121,12 @@ def _words(hint: Any) -> str:
     if origin is tuple and inner and Ellipsis not in inner:
         return f"({', '.join(_words(each) for each in inner)})"
     if origin in (Sequence, tuple, list) and inner:
-        return f"a list, with each {_words(inner[0])}"
+        return f"a list, each item {_words(inner[0])}"
     if origin is np.ndarray:
         return "an array of numbers"
     if hint is PathLike or origin is PathLike:
         return "the path of a file or folder (str or pathlib.Path)"
     if origin is Mapping and len(inner) == 2:
-        return f"a dict, with each value {_words(inner[1])}"
+        return f"a dict, each value {_words(inner[1])}"
     name = getattr(origin or hint, "__name__", str(hint))
     return _WANTED.get(name, f"a {getattr(origin or hint, '__module__', '').split('.')[0]}.{name}")

@@ -30,7 +30,7 @@ def frozen(values: npt.ArrayLike, dtype: type[_T]) -> npt.NDArray[_T]:
     try:
         array = np.ascontiguousarray(values, dtype=dtype).view()
     except (TypeError, ValueError) as failure:
-        raise InputError(f"Numbers are needed; got {shown(values)}.") from failure
+        raise InputError(f"An array of numbers is needed; got {shown(values)}.") from failure
     array.flags.writeable = False
     return array
 
@@ -39,5 +39,5 @@ def as_points(points_mm: npt.ArrayLike) -> FloatArray:
     """Points (n, 3), C-ordered; InputError for any other shape, which compiled loops would read past."""
     points = np.ascontiguousarray(points_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"Points are an array (n, 3), LPS mm; got shape {points.shape}. One point is [[x, y, z]].")
+        raise InputError(f"Points must be an array (n, 3), LPS mm; got shape {points.shape}. One point: [[x, y, z]].")
     return points

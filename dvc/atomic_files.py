@@ -26,7 +26,7 @@ def whole_file(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(part, path)
     except OSError as error:
-        advice = "Check that the folder exists and may be written to, and that the disk has room."
+        advice = "Check that the folder exists and is writable, and that the disk has space."
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}). {advice}") from error
     finally:
         with suppress(OSError):
@@ -78,5 +78,5 @@ def whole_folder(final: Path) -> Iterator[Path]:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
-        advice = "Check the folder's rights and the room on the disk; nothing half-written is left."
+        advice = "Check the permissions of the folder and the disk space. No incomplete results were left."
         raise OutputError(f"{final}: results cannot be written ({error.strerror or error}). {advice}") from error

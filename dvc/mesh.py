@@ -74,11 +74,11 @@ class TetMesh:
         points = checked_points(points_mm)
         tets = checked_indices("cells", cells, len(points), 4)
         if len(tets) == 0:
-            raise InputError("The mesh has no tetrahedron.")
+            raise InputError("The mesh has no tetrahedra.")
         ids = np.arange(len(points)) if node_ids is None else np.asarray(node_ids)
         if ids.shape != (len(points),) or ids.dtype.kind not in "iu" or len(np.unique(ids)) != len(ids):
             got = f"got shape {ids.shape} of {ids.dtype}, {len(np.unique(ids))} of them different"
-            raise InputError(f"node_ids must be a whole number of its own for each of the {len(points)} nodes; {got}.")
+            raise InputError(f"node_ids must be a different whole number for each of the {len(points)} nodes; {got}.")
         for name, named in (("regions", regions), ("facets", facets)):
             check(name, named, Mapping[str, IntArray] | None)
         named_cells = {n: checked_indices(f"region {n!r}", i, len(tets)) for n, i in (regions or {}).items()}
@@ -92,9 +92,9 @@ class TetMesh:
         if not used.all():
             for name, index in named_facets.items():
                 if not used[index].all():
-                    raise InputError(f"facets {name!r} lie on nodes that no tetrahedron uses.")
+                    raise InputError(f"facets {name!r} use nodes that are not in any tetrahedron.")
             _log.info(
-                "%d of %d nodes belong to no tetrahedron and are left out; the first is node %d.",
+                "%d of %d nodes are not in any tetrahedron and are removed; the first is node %d.",
                 np.count_nonzero(~used), len(used), ids[np.argmin(used)],
             )  # fmt: skip
             new_index = np.cumsum(used) - 1
@@ -184,14 +184,14 @@ def check_extent(points_mm: FloatArray) -> None:
     spans = f"It spans {box_told(points_mm.min(axis=0), points_mm.max(axis=0))} (mm as read)."
     if extent < _SMALLEST_EXTENT_MM:
         raise ExtentError(
-            f"The mesh is {extent:.3g} mm across, and a mesh in mm is not that small: its coordinates are "
-            f"probably in metres. {spans} If so, say unit='m' (--mesh-unit m; compare: --model-unit m)."
+            f"The mesh is {extent:.3g} mm across, which is too small for a mesh in mm: its coordinates are "
+            f"probably in metres. {spans} If so, set unit='m' (--mesh-unit m; compare: --model-unit m)."
         )
     if extent > _LARGEST_EXTENT_MM:
         raise ExtentError(
-            f"The mesh is {extent / 1000:.4g} m across, and no body part is that large: its coordinates are "
-            f"probably in mm and not in metres, or finer. {spans} Say unit='mm' (--mesh-unit mm; compare: "
-            "--model-unit mm), or scale them to mm."
+            f"The mesh is {extent / 1000:.4g} m across, which is too large for a body part: its coordinates are "
+            f"probably in mm, or in a smaller unit. {spans} Set unit='mm' (--mesh-unit mm; compare: --model-unit "
+            "mm), or scale the coordinates to mm."
         )
 
 
@@ -210,8 +210,8 @@ def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray)
         first = int(np.argmax(flat))
         raise GeometryError(
             f"{np.count_nonzero(flat)} of {len(cells)} tetrahedra are degenerate (no volume); the first is "
-            f"cell {first}, nodes {node_ids[cells[first]].tolist()}, {volumes[first]:.3g} mm3. Mend the mesh where it "
-            "was made: remove or remesh them."
+            f"cell {first}, nodes {node_ids[cells[first]].tolist()}, {volumes[first]:.3g} mm3. Remove these cells or "
+            "remesh in the program that made the mesh."
         )
     negative = volumes < 0
     if not negative.any():
@@ -219,13 +219,13 @@ def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray)
     if not negative.all() and (overlapping := _overlapping(points, cells)).any():
         first = int(np.argmax(overlapping))
         raise GeometryError(
-            f"{np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted (negative volume), and "
-            f"{np.count_nonzero(overlapping)} overlap a neighbour across a common face, the first of them cell "
-            f"{first}, nodes {node_ids[cells[first]].tolist()}: the mesh folds over itself. Mend it where it was made."
+            f"The mesh folds over itself: {np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted "
+            f"(negative volume), and {np.count_nonzero(overlapping)} overlap a neighbour across a common face. The "
+            f"first is cell {first}, nodes {node_ids[cells[first]].tolist()}. Repair it in the program that made it."
         )
     _log.warning(
-        "%d of %d tetrahedra count their nodes the other way round (negative volume); two nodes of each were "
-        "swapped. Their shape and place are unchanged, and no cell overlaps its neighbour.",
+        "%d of %d tetrahedra have the opposite node order (negative volume); two nodes of each were swapped. Shape "
+        "and position are unchanged, and no cell overlaps its neighbour.",
         np.count_nonzero(negative), len(cells),
     )  # fmt: skip
     ordered = cells.copy()

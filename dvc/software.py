@@ -67,5 +67,5 @@ def _package(package: str) -> tuple[str, frozenset[str]]:
 def _folder(package: str) -> Path:
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError(f"mrstrain is not whole: its package '{package}' is missing. Install it again.")
+        raise ModuleNotFoundError(f"mrstrain is incomplete: its package '{package}' is missing. Install it again.")
     return Path(spec.submodule_search_locations[0])

@@ -40,7 +40,7 @@ class Worker(AbstractContextManager["Worker", None]):
 
     def __init__(self, threads: int) -> None:
         if threads < 1:
-            raise ValueError(f"A worker needs at least one thread; got {threads}.")
+            raise ValueError(f"`threads` of a worker must be 1 or more; got {threads}.")
         self.threads = threads
         self._executor: ProcessPoolExecutor | None = None
         self._lock = threading.Lock()
@@ -72,9 +72,9 @@ class Worker(AbstractContextManager["Worker", None]):
                     self._executor = None
                     code = re.search(r"\{(.*)\}", str(died), re.DOTALL)
                     raise WorkerError(
-                        f"The process {what} died (exit code {code[1] if code else 'unknown'}). Native code crashed or "
-                        "the system ended it, most often for lack of memory. Free memory, use fewer --workers, or, "
-                        "with parameter files of your own that hold several metrics, set "
+                        f"The process {what} died (exit code {code[1] if code else 'unknown'}): the system ended it, "
+                        "most often for lack of memory, or native code crashed. Free memory or use fewer --workers. In "
+                        "your own elastix parameter files with several metrics, set "
                         '(UseMultiThreadingForMetrics "false").'
                     ) from died
 

@@ -114,10 +114,10 @@ class Heel:
 
     def __post_init__(self) -> None:
         if self.seed < 0:
-            raise InputError(f"The heel's seed must be 0 or more; got {self.seed}.")
+            raise InputError(f"The seed of a heel must be 0 or more; got {self.seed}.")
         for name, (low, high) in _RANGES.items():
             if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name} must lie between {low:g} and {high:g}; got {getattr(self, name)}.")
+                raise InputError(f"{name} must be between {low:g} and {high:g}; got {getattr(self, name)}.")
         random = np.random.default_rng([self.seed, 1])
 
         def vary(shapes: tuple[tuple[_Triple, _Triple, _Triple], ...], jitter: float) -> list[Any]:

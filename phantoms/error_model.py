@@ -65,7 +65,7 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
     presets = {r.case.preset for r in runs}
     plain = [r for r in runs if r.case.wavelength_mm is None]
     if len(presets) != 1 or not plain:
-        raise InputError(f"An error model is of one preset and needs motions other than waves; got {sorted(presets)}.")
+        raise InputError(f"An error model needs one preset, and motions other than waves; got {sorted(presets)}.")
     tables = tuple(replace(_table(some), widening=_widening(_validations(some))) for _, some in by_condition(plain))
     digest = hashlib.sha256(parameters.encode()).hexdigest()
     return ErrorModel(Path(presets.pop()).name, digest, tables, source)

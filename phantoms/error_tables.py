@@ -73,7 +73,7 @@ def errors_by_tissue(
     """
     shape = labels.grid.shape
     if where.shape != shape:
-        raise GeometryError(f"The voxels to compare have shape {where.shape}; the labels' grid has {shape}.")
+        raise GeometryError(f"The voxels to compare have shape {where.shape}, but the grid of the labels {shape}.")
     inside = where & (labels.labels > 0)
     true_u, true_H = evaluate_on_grid(truth, labels.grid, inside)
     u, H = evaluate_on_grid(measured, labels.grid, inside)
@@ -93,7 +93,7 @@ def errors_of_maps(labels: LabelMap, truth: StrainMaps, measured: StrainMaps) ->
     """
     for name, maps in (("true", truth), ("measured", measured)):
         if not maps.grid.same_as(labels.grid):
-            raise GeometryError(f"The {name} maps are not on the labels' grid.")
+            raise GeometryError(f"The {name} maps are on another grid than the labels.")
     where = truth.valid & measured.valid & (labels.labels > 0)
     fields = (truth.max_shear, measured.max_shear, measured.jacobian, truth.displacement_mm, measured.displacement_mm)
     return _by_tissue(labels.names, labels.labels[where], *(field[where].astype(np.float64) for field in fields))

@@ -33,10 +33,15 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
             axes.plot(at, rmse, color=REGION_COLOURS[number], marker=_MARKS[number], linewidth=1.8, label=tissue)
             axes.plot(at, bias, color=REGION_COLOURS[number], linestyle="--", marker=".", linewidth=1.2)
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
-    label_axes(axes, by, "error of the max. shear")
+    label_axes(axes, words(by), "error of the max. shear")
     if axes.get_legend_handles_labels()[0]:  # a small study may have no bin that is large enough
         axes.legend(fontsize=9, frameon=False)
     return png_bytes(figure)
+
+
+def words(by: str) -> str:
+    """What errors are shown by, from its name in the tables."""
+    return by.replace("a border", "a tissue interface")
 
 
 def resolution(rows: Sequence[ResolutionRow]) -> bytes:

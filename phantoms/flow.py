@@ -212,7 +212,7 @@ class Border:
 
     def __post_init__(self) -> None:
         if not self.ramp > 0 or self.order not in {2, 3}:
-            raise InputError(f"A border needs ramp > 0 and order 2 or 3; got {self.ramp} and {self.order}.")
+            raise InputError(f"`ramp` must be above 0 and `order` 2 or 3; got {self.ramp} and {self.order}.")
 
     def _numbers(self) -> tuple[FloatArray, FloatArray]:
         """Per ellipsoid its centre and its form's xx, xy, xz, yy, yz, zz, (n, 9); then sharpness, ramp and order."""
@@ -276,12 +276,12 @@ class Flow:
         for name in ("plate_mm", "pivot_mm", "centre_mm", "width_mm"):
             vector = frozen(getattr(self, name), np.float64)
             if vector.shape != (3,) or not np.isfinite(vector).all():
-                raise InputError(f"A flow's {name} needs three finite components; got {vector.tolist()}.")
+                raise InputError(f"The {name} of a flow needs three finite components; got {vector.tolist()}.")
             object.__setattr__(self, name, vector)
         if not (self.width_mm > 0).all():
-            raise InputError(f"A flow's width_mm must be positive; got {self.width_mm.tolist()}.")
+            raise InputError(f"The width_mm of a flow must be positive; got {self.width_mm.tolist()}.")
         if self.steps < 1:
-            raise InputError(f"A flow needs one step or more; got {self.steps}.")
+            raise InputError(f"A flow needs at least one step; got {self.steps}.")
 
     def _follow(self, points_mm: FloatArray, gradient: bool) -> tuple[FloatArray, FloatArray]:
         points = as_points(points_mm)

@@ -110,7 +110,7 @@ def heel_pair(
         If the seed is negative, the load is outside 0 to 1.5, or the SNR or the grid is out of range.
     """
     if not 0.0 <= load <= 1.5:
-        raise InputError(f"The load must lie between 0 and 1.5; got {load}.")
+        raise InputError(f"The load must be between 0 and 1.5; got {load}.")
     heel, grid = Heel(seed), centred_grid(shape, spacing_mm)
     foot = foot_motion or default_foot_motion()
     flow = pressed(heel, load) if motion is None else motion
@@ -257,7 +257,7 @@ def under_load(heel: Heel, load: str) -> Motion:
     u is relative to bone, LPS mm, reference configuration; InputError for another load.
     """
     if load not in LOADS:
-        raise InputError(f"No load '{load}'; there are {', '.join(LOADS)}.")
+        raise InputError(f"Unknown load '{load}'; choose one of {', '.join(LOADS)}.")
     press, shear, slide = LOADS[load]
     return Composed([sliding(heel, slide), under_plate(heel, press_mm=press, shear_mm=shear)])
 
@@ -280,7 +280,7 @@ def motion_named(heel: Heel, name: str) -> Motion | None:
         return _MOTIONS[name](heel)
     wavelength = wavelength_of(name)
     if wavelength is None:
-        raise InputError(f"No motion '{name}'; there are {', '.join(_MOTIONS)} and wave-L (L in mm).")
+        raise InputError(f"Unknown motion '{name}'; choose one of {', '.join(_MOTIONS)} or wave-L (L in mm).")
     # Along the foot, varying across the pad's thickness; each heel has a phase of its own.
     phase = float(np.random.default_rng([heel.seed, 4]).uniform(0.0, 2.0 * np.pi))
     return ShearWave(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), wavelength, _WAVE_PEAK, phase)
@@ -355,13 +355,13 @@ def heel_grid(spacing_mm: float | Sequence[float], size: float = 1.0) -> Grid:
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     if spacing.shape not in {(), (3,)} or not ((spacing >= _FINEST_MM) & (spacing <= _COARSEST_MM)).all():
         raise InputError(
-            f"Voxel spacing is one length or three between {_FINEST_MM} and {_COARSEST_MM} mm; got {spacing_mm}."
+            f"Voxel spacing must be one length or three between {_FINEST_MM} and {_COARSEST_MM} mm; got {spacing_mm}."
         )
     i, j, k = (int(n) for n in np.round(size * np.array(_FIELD_MM) / np.broadcast_to(spacing, 3)))
     if max(i, j, k) > _LARGEST:
         raise InputError(
-            f"A heel of size {size} at {spacing_mm} mm needs {i} x {j} x {k} voxels, more than {_LARGEST} along an "
-            "axis; choose larger voxels."
+            f"A heel of size {size} at {spacing_mm} mm needs {i} x {j} x {k} voxels; the limit is {_LARGEST} along an "
+            "axis. Choose larger voxels."
         )
     return centred_grid((i, j, k), spacing_mm)
 

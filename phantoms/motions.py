@@ -56,9 +56,9 @@ def _about(F: FloatArray, centre_mm: FloatArray) -> Affine:
 def _frame(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
     a, b = frozen(first, np.float64), frozen(second, np.float64)
     if a.shape != (3,) or b.shape != (3,):
-        raise InputError(f"Directions have three components; got {a.tolist()} and {b.tolist()}.")
+        raise InputError(f"Directions must have three components; got {a.tolist()} and {b.tolist()}.")
     if abs(a @ a - 1) > _UNIT or abs(b @ b - 1) > _UNIT or abs(a @ b) > _UNIT:
-        raise InputError(f"The two directions must be unit vectors at right angles; got {a.tolist()} and {b.tolist()}.")
+        raise InputError(f"The directions must be perpendicular unit vectors; got {a.tolist()} and {b.tolist()}.")
     return a, b
 
 
@@ -153,7 +153,7 @@ class Bending:
         for name, vector in zip(("length", "thickness"), _frame(self.length, self.thickness), strict=True):
             object.__setattr__(self, name, vector)
         if not (np.isfinite(self.radius_mm) and self.radius_mm > 0):
-            raise InputError(f"A bending radius must be positive, mm; got {self.radius_mm}.")
+            raise InputError(f"The bending radius must be positive, mm; got {self.radius_mm}.")
 
     def _axes(self) -> FloatArray:
         """Columns: length, thickness, and the axis of bending."""

@@ -98,7 +98,7 @@ def synthetic_warp(
     Buades, Coll and Morel, CVPR 2005, doi:10.1109/CVPR.2005.38 (non-local means).
     """
     if not tissue.grid.same_as(reference.grid) or not tissue.inside.any():
-        raise InputError("The tissue mask is not on the unloaded image's grid, or it is empty.")
+        raise InputError("The tissue mask is empty, or on another grid than the unloaded image.")
     grid, near = acquisition.grid or reference.grid, near or RigidMotion.identity()
     shown = _shown(tissue, motion, grid)
     sigma = noise_sd(reference, tissue)
@@ -121,20 +121,20 @@ def _shown(tissue: Mask, motion: Deformation, grid: Grid) -> float:
     points = tissue.points()
     known: BoolArray = np.all(np.isfinite(H), axis=(1, 2)) & np.all(np.isfinite(u), axis=1)
     if np.count_nonzero(known) < 0.5 * len(known):
-        raise InputError(f"The deformation is defined in {known.mean():.0%} of the tissue only; half of it is needed.")
+        raise InputError(f"The deformation is defined in only {known.mean():.0%} of the tissue; 50% is needed.")
     folded = np.flatnonzero(known)[np.linalg.det(H[known] + np.eye(3)) <= 0.0]
     if len(folded):
         at = points[folded[0]]
         raise InputError(
             f"The deformation folds (det F <= 0) in {len(folded)} voxels of the tissue, such as at LPS "
-            f"({at[0]:.1f}, {at[1]:.1f}, {at[2]:.1f}) mm: no image can show it."
+            f"({at[0]:.1f}, {at[1]:.1f}, {at[2]:.1f}) mm. An image cannot be warped by it."
         )
     moved = points + u
     shown = np.count_nonzero(grid.contains(moved[np.isfinite(moved).all(axis=1)])) / len(points)
     if shown < 0.5:
         raise InputError(
-            f"The deformation moves {1 - shown:.0%} of the tissue out of the image's field of view, or is "
-            "not defined there. Give one of this image, bone motion included, or a mask that fits."
+            f"The deformation moves {1 - shown:.0%} of the tissue out of the field of view, or is not defined there. "
+            "Pass a deformation of this image that includes the bone motion, or a smaller tissue mask."
         )
     return shown
 

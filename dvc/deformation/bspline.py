@@ -37,7 +37,7 @@ class BSpline:
     Parameters
     ----------
     control : Grid
-        Places of the control points, LPS mm; four or more along each axis.
+        Positions of the control points, LPS mm; at least four along each axis.
     coefficients_mm : (3, ni, nj, nk)
         LPS components of the coefficients, indexed along the control grid's own axes, mm.
 
@@ -48,10 +48,9 @@ class BSpline:
 
     Notes
     -----
-    Defined where all 4 x 4 x 4 control points of the support exist: ``1 <= t < n - 2`` along
-    each axis, the far face left out. That is elastix' rule; where it does not hold, elastix answers with
-    the identity, a displacement of zero that was never measured, and this class with NaN. (ITK's own
-    B-spline transform counts the far face in.)
+    Defined where all 4 x 4 x 4 control points of the support exist: ``1 <= t < n - 2`` along each axis,
+    without the far face. This is the rule of elastix; outside, elastix returns the identity, a displacement
+    of zero that was never measured, and this class NaN. (The B-spline transform of ITK includes the far face.)
 
     References
     ----------
@@ -83,7 +82,7 @@ class BSpline:
                 f"B-spline coefficients have shape {coefficients.shape}; the grid needs {needed}, component first."
             )
         if min(self.control.shape) < _SUPPORT:
-            raise InputError(f"A cubic B-spline needs four control points or more per axis; got {self.control.shape}.")
+            raise InputError(f"A cubic B-spline needs at least four control points per axis; got {self.control.shape}.")
         object.__setattr__(self, "coefficients_mm", coefficients)
 
     @property
@@ -115,7 +114,7 @@ class BSpline:
         """
         where = frozen(where, np.bool_)
         if where.shape != grid.shape:
-            raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
+            raise InputError(f"The mask 'where' has shape {where.shape}, but the grid {grid.shape}.")
         placed = self._axis_indices(grid)
         if placed is None:
             return self.evaluate(grid.points(where))

@@ -29,7 +29,7 @@ _EVEN = 0.7  # voxels
 _LEAST_MM = 0.05  # every voxel stays on its own side of the border
 _GAP_MM = 3.0  # from a tissue: what has no label there belongs to it
 NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm": _LEAST_MM, "gap_mm": _GAP_MM}
-"""Every number that decides where a border lies, for a record."""
+"""Every number that determines the position of an interface, for a record."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,12 +59,12 @@ class Interfaces:
         """
         for name, mask in (("bone", bone), ("body", body)):
             if mask is not None and not mask.grid.same_as(labels.grid):
-                raise GeometryError(f"The {name} is not on the grid of the label map; bring it there (fit_mask).")
+                raise GeometryError(f"The {name} is not on the grid of the label map; resample it with fit_mask.")
         if not (np.isfinite(reach_mm) and reach_mm > 0):
-            raise InputError(f"The reach of a border must be above 0 mm; got {reach_mm}.")
+            raise InputError(f"The reach of an interface (reach_mm) must be above 0 mm; got {reach_mm}.")
         values = labels.labels if bone is None else np.where(bone.inside, -1, labels.labels)  # -1: bone at rest
         if not values.any():
-            raise InputError("The label map has no tissue in the part of the image that is registered.")
+            raise InputError("The label map has no labelled tissue in the registered part of the image.")
         spacing = labels.grid.spacing_mm
         if body is not None and (unknown := body.inside & (values == 0)).any():
             filled = np.where(unknown, values.max() + 1, values)
@@ -210,9 +210,9 @@ def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
 class InterfaceSpline:
     """x = X + u(X), u = m v + psi w: two cubic B-splines v (mm) and w, and the factors of `Interfaces`.
 
-    u is continuous, and zero in the bone at rest. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad
-    psi jumps across borders: by 2 m w (x) n, n the border's normal, between two tissues that both may move. On a border
-    it is that of the side on which rounding puts the point.
+    u is continuous, and zero in the rigid bone. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad psi
+    is discontinuous at interfaces: between two tissues that may both move, by 2 m w (x) n, n the normal of the
+    interface. Exactly on an interface, H is that of either side, by rounding.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ class InterfaceSpline:
 
     def __post_init__(self) -> None:
         if not self.smooth.control.same_as(self.jump.control, tolerance_voxels=1e-6):
-            raise GeometryError("The two splines of an interface spline need one control grid.")
+            raise GeometryError("The two splines of an interface spline must have the same control grid.")
 
     @property
     def control(self) -> Grid:
@@ -271,7 +271,7 @@ class InterfaceSpline:
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid; order and errors as in `BSpline`."""
         if where.shape != grid.shape:
-            raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
+            raise InputError(f"The mask 'where' has shape {where.shape}, but the grid {grid.shape}.")
         step = max(1, CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: memory stays that of the result
         found = []
         for start in range(0, grid.shape[0], step):

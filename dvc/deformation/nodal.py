@@ -62,8 +62,8 @@ class OnMesh:
         u = frozen(self.u_mm, np.float64)
         if u.shape != self.mesh.points_mm.shape or not np.isfinite(u).all():
             raise InputError(
-                f"A displacement on a mesh of {len(self.mesh.points_mm)} nodes needs three finite numbers for each; "
-                f"got shape {u.shape}, {np.count_nonzero(~np.isfinite(u))} of them not finite."
+                f"The displacement needs three finite numbers for each of the {len(self.mesh.points_mm)} nodes; "
+                f"got shape {u.shape} with {np.count_nonzero(~np.isfinite(u))} values that are not finite."
             )
         object.__setattr__(self, "u_mm", u)
         object.__setattr__(self, "_locator", Locator(self.mesh))

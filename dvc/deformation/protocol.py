@@ -112,7 +112,7 @@ class Affine:
     def __post_init__(self) -> None:
         matrix, translation = frozen(self.matrix, np.float64), frozen(self.translation_mm, np.float64)
         if matrix.shape != (3, 3) or translation.shape != (3,):
-            raise InputError(f"{self._KIND} needs a 3 x 3 matrix and three translations in mm.")
+            raise InputError(f"{self._KIND} needs a 3 x 3 matrix and a translation of three numbers, mm.")
         if not (np.isfinite(matrix).all() and np.isfinite(translation).all()):
             raise InputError(f"{self._KIND} needs finite numbers; got {matrix.tolist()} and {translation.tolist()}.")
         object.__setattr__(self, "matrix", matrix)
@@ -159,7 +159,7 @@ class RigidMotion(Affine):
         Affine.__post_init__(self)
         error = np.abs(self.rotation.T @ self.rotation - np.eye(3)).max()
         if not error < 1e-6 or np.linalg.det(self.rotation) < 0:
-            raise InputError(f"Not a proper rotation (R^T R differs from I by {error:.2g}).")
+            raise InputError(f"The matrix is not a proper rotation (R^T R differs from I by {error:.2g}).")
 
     @property
     def rotation(self) -> FloatArray:
@@ -228,7 +228,7 @@ class Composed:
         back: list[Deformation] = []
         for part in reversed(self.parts):
             if not isinstance(part, Motion):
-                raise InputError(f"A composition has an inverse where its parts have; {type(part).__name__} has none.")
+                raise InputError(f"This composition has no inverse, because its {type(part).__name__} has no inverse.")
             back.append(part.inverse())
         return type(self)(back)
 
@@ -306,12 +306,12 @@ class SampledDisplacement:
     def __init__(self, grid: Grid, displacement_mm: FloatArray) -> None:
         values = np.asarray(displacement_mm, dtype=np.float64)
         if values.shape != (*grid.shape, 3):
-            raise InputError(f"The displacement has shape {values.shape}; its grid needs {(*grid.shape, 3)}.")
+            raise InputError(f"The displacement has shape {values.shape}, but its grid needs {(*grid.shape, 3)}.")
         if min(grid.shape) < 2:
-            raise InputError(f"A displacement grid needs two voxels or more along each axis; got {grid.shape}.")
+            raise InputError(f"A displacement field needs at least two voxels along each axis; got {grid.shape}.")
         undefined = np.asarray(~np.isfinite(values).all(axis=-1))
         if undefined.all():
-            raise InputError("The displacement field has no defined voxel.")
+            raise InputError("The displacement field is undefined (NaN) at all voxels.")
         low, high = (np.array([edge(axis) for axis in np.nonzero(~undefined)]) for edge in (np.min, np.max))
         box = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
         values = _carried_past_borders(values[box], undefined[box], grid.spacing_mm)

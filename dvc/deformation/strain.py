@@ -78,7 +78,7 @@ class StrainField:
         """
         H = np.ascontiguousarray(gradient, dtype=np.float64)
         if H.ndim != 3 or H.shape[1:] != (3, 3):
-            raise InputError(f"Displacement gradients have shape (n, 3, 3); got {H.shape}.")
+            raise InputError(f"Displacement gradients must have shape (n, 3, 3); got {H.shape}.")
         count = len(H)
         strain, principal, shear, jacobian = (np.empty((count, *shape)) for shape in ((3, 3), (3,), (), ()))
         valid = np.empty(count, dtype=np.bool_)
@@ -139,7 +139,7 @@ class StrainField:
         """
         A = np.asarray(axes, dtype=np.float64)
         if A.shape != (3, 3) or not np.abs(A.T @ A - np.eye(3)).max() < _ORTHONORMAL:
-            raise InputError(f"Axes are three perpendicular unit vectors, columns of a 3 x 3 matrix; got {A.tolist()}.")
+            raise InputError(f"Axes must be perpendicular unit vectors, columns of a 3 x 3 matrix; got {A.tolist()}.")
         return np.asarray(A.T @ self.green_lagrange @ A)
 
 
@@ -164,10 +164,10 @@ def plate_axes(normal: npt.ArrayLike, shear: npt.ArrayLike) -> FloatArray:
     [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
     """
     first = _unit(normal, "normal")
-    second = _unit(shear, "direction of shear")
+    second = _unit(shear, "shear direction")
     second = second - (second @ first) * first
     if np.linalg.norm(second) < _PARALLEL_SINE:
-        raise InputError("The plate's normal and its direction of shear are parallel; give two different directions.")
+        raise InputError("The plate normal and the shear direction are parallel; they must differ.")
     second = second / np.linalg.norm(second)
     second = second - (second @ first) * first  # once more: the first time loses digits where the two are close
     second = second / np.linalg.norm(second)
@@ -217,7 +217,7 @@ def principal_values(tensors: npt.ArrayLike) -> FloatArray:
     """
     array = np.ascontiguousarray(tensors, dtype=np.float64)
     if array.ndim != 3 or array.shape[1:] != (3, 3):
-        raise InputError(f"Tensors have shape (n, 3, 3); got {array.shape}.")
+        raise InputError(f"Tensors must have shape (n, 3, 3); got {array.shape}.")
     values = np.empty((len(array), 3))
     in_parts(_principal_of, len(array), array, values)
     return values

@@ -64,12 +64,12 @@ class Grid:
         if origin.shape != (3,) or not np.all(np.isfinite(origin)):
             raise GeometryError(f"The grid's origin must be three finite coordinates in mm; got {origin.tolist()}.")
         if direction.shape != (3, 3) or not np.all(np.isfinite(direction)):
-            raise GeometryError("The grid's direction must be a finite 3 x 3 matrix.")
+            raise GeometryError("The direction of the grid must be a finite 3 x 3 matrix.")
         skew = float(np.abs(direction.T @ direction - np.eye(3)).max())
         if skew > _ORTHONORMAL_TOLERANCE:
             raise GeometryError(
-                f"The grid's axes are not perpendicular unit vectors (largest deviation {skew:.2g}): the "
-                "affine is sheared or its spacing is wrong. Resample the image to a regular grid first."
+                f"The axes of the grid are not perpendicular unit vectors (largest deviation {skew:.2g}): the affine "
+                "is sheared, or the spacing is wrong. Resample the image to a regular grid first."
             )
         for name, value in (("shape", shape), ("spacing_mm", spacing), ("origin_mm", origin), ("direction", direction)):
             object.__setattr__(self, name, value)
@@ -180,7 +180,7 @@ def _on(grid: Grid, what: str, values: npt.ArrayLike, kind: type[_T]) -> npt.NDA
     check("grid", grid, Grid)
     array = frozen(values, kind)
     if array.shape != grid.shape:
-        raise GeometryError(f"{what} has shape {array.shape}, its grid has {grid.shape}; they must be equal.")
+        raise GeometryError(f"{what} has shape {array.shape}, but its grid {grid.shape}; they must be equal.")
     return array
 
 
@@ -207,7 +207,7 @@ class Image:
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", _on(self.grid, "The image", self.values, np.float32))
         if np.isinf(self.values).any():
-            raise InputError("The image holds infinite values; set them to NaN (missing) or repair them.")
+            raise InputError("The image has infinite values; set them to NaN (missing) or repair them.")
 
     @property
     def missing(self) -> BoolArray:
@@ -242,10 +242,10 @@ class Mask:
     def __post_init__(self) -> None:
         given = np.asarray(self.inside)
         if given.dtype.kind in "iuf" and not ((given == 0) | (given == 1)).all():
-            kind = "grey values. Compare them: Mask(grid, values > level)"
+            kind = "grey values. Apply a threshold: Mask(grid, values > level)"
             if given.dtype.kind != "f":
-                kind = "labels. Choose one: Mask(grid, labels == number), or label_map.region(name)"
-            raise InputError(f"A mask holds 0 and 1; these are {kind}.")
+                kind = "labels. Select one: Mask(grid, labels == number), or label_map.region(name)"
+            raise InputError(f"A mask must have only 0 and 1; these are {kind}.")
         object.__setattr__(self, "inside", _on(self.grid, "The mask", self.inside, np.bool_))
 
     def box(self, around: int = 0) -> tuple[slice, slice, slice]:
@@ -298,7 +298,7 @@ class LabelMap:
     def __post_init__(self) -> None:
         given = np.asarray(self.labels)
         if given.dtype.kind == "f" and not (given == np.rint(given)).all():
-            raise InputError("Labels are whole numbers; these are not. Resample a label map by nearest neighbour.")
+            raise InputError("Labels must be whole numbers. Resample label maps only by nearest neighbour.")
         object.__setattr__(self, "labels", _on(self.grid, "The label map", self.labels, np.int64))
         present = np.unique(self.labels).tolist()
         if present and present[0] < 0:
@@ -306,7 +306,7 @@ class LabelMap:
         if nameless := [v for v in present if v != 0 and v not in self.names]:
             raise InputError(f"Labels without a name: {nameless}. Names given: {dict(self.names)}.")
         if twice := sorted(name for name, count in Counter(self.names.values()).items() if count > 1):
-            raise InputError(f"Region names used for more than one label: {twice}.")
+            raise InputError(f"Region names must be unique; used for several labels: {twice}.")
         object.__setattr__(self, "names", dict(self.names))
 
     def region(self, name: str) -> Mask:
@@ -320,7 +320,7 @@ class LabelMap:
         """The error for a name that no label has."""
         listed = ", ".join(sorted(self.names.values())) or "none"
         unnamed = all(known.startswith("label-") for known in self.names.values())
-        told = " It came without a table of names (names; --names on the command line), so labels go by their numbers."
+        told = " No table of names was given (names; --names on the command line), so labels are named by number."
         return InputError(f"The label map has no region '{name}'; it has {listed}.{told if unnamed else ''}")
 
     def toward_lps(self) -> Self:

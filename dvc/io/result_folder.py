@@ -42,7 +42,7 @@ FIGURES, REPORT = "figures", "report.html"
 REPEAT = "repeat"
 """Name of the folder of a repeat scan's results."""
 
-AGAIN = "Register this load again, or get a whole copy of the folder."
+AGAIN = "Register this load again, or copy the whole folder again."
 _DISPLACEMENT = "displacement of tissue relative to its bone: u(X) = x - X at the voxels of the unloaded image"
 _GREEN_LAGRANGE = "Green-Lagrange strain E = (F^T F - I) / 2"
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -66,7 +66,7 @@ class ResultFolder:
             try:
                 verdict = Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
             except (KeyError, TypeError, InputError) as failure:
-                raise InputError(f"{folder / QUALITY}: it holds no verdict ({failure!r}). {AGAIN}") from failure
+                raise InputError(f"{folder / QUALITY}: the verdict is missing ({failure!r}). {AGAIN}") from failure
             aligned_on = str(told.get("alignment", {}).get("on", ""))
         return cls(folder, read_error_model(model).tables[0] if model.is_file() else None, verdict, aligned_on)
 
@@ -98,8 +98,8 @@ def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]
     folders = [place] if (place / DISPLACEMENT).is_file() else sorted(p.parent for p in place.glob(f"*/{DISPLACEMENT}"))
     folders = [f for f in folders if f == place or f.name != REPEAT]
     if not folders:
-        what = f"no results of `register` or `strain` here (LOAD/{DISPLACEMENT})"
-        raise InputError(f"{place}: {what}. Give the folder they wrote.")
+        what = f"no results of `mrstrain register` or `strain` in this folder (LOAD/{DISPLACEMENT})"
+        raise InputError(f"{place}: {what}. Pass the folder that they wrote.")
     names = [folder.resolve().name for folder in folders]
     absent = [load for load in loads if load not in names]
     if absent:
@@ -114,7 +114,7 @@ def spline_in(folder: Path) -> Deformation:
             return read_transform(folder / name)
     if (folder / ITK_TRANSFORM).is_file() and (folder / DISPLACEMENT).is_file():
         return read_displacement(folder / DISPLACEMENT)
-    raise InputError(f"{folder} has neither {SPLINE_WITH_BORDERS} nor {SPLINE}: register this load again.")
+    raise InputError(f"{folder}: neither {SPLINE_WITH_BORDERS} nor {SPLINE} is there. Register this load again.")
 
 
 def read_quality(folder: Path) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def read_quality(folder: Path) -> dict[str, Any]:
         if not isinstance(told, dict):
             raise ValueError(f"a {type(told).__name__}, not an object")
     except (OSError, ValueError) as failure:
-        raise InputError(f"{path}: the quality of a registration cannot be read ({failure}). {AGAIN}") from failure
+        raise InputError(f"{path}: the quality of the registration cannot be read ({failure}). {AGAIN}") from failure
     return told
 
 
@@ -182,13 +182,13 @@ def _components(path: Path, grid: Grid, count: int) -> Float32Array:
 
 def _there(path: Path) -> Path:
     if not path.is_file():
-        raise InputError(f"{path}: this file of a measurement's folder is missing. {AGAIN}")
+        raise InputError(f"{path}: this file is missing from the results of a load. {AGAIN}")
     return path
 
 
 def _same_grid(path: Path, found: Grid, wanted: Grid) -> None:
     if not found.same_as(wanted):
-        raise ImageFileError(f"{path}: on another grid than {MAX_SHEAR} beside it. {AGAIN}")
+        raise ImageFileError(f"{path}: on another grid than {MAX_SHEAR} in the same folder. {AGAIN}")
 
 
 def write_displacement(folder: Path, grid: Grid, displacement_mm: Float32Array, verdict: Verdict | None = None) -> None:
@@ -230,7 +230,7 @@ def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel]
             rows = [[row[name] for name in names] for row in csv.DictReader(file)]
         intervals = tuple(Interval(region, figure, *map(float, rest)) for region, figure, *rest in rows)
     except (OSError, ValueError, KeyError, TypeError) as failure:
-        raise InputError(f"{path}: no table of intervals ({failure!r}). {AGAIN}") from failure
+        raise InputError(f"{path}: not a table of intervals ({failure!r}). {AGAIN}") from failure
     return Uncertainty(sigma.values, intervals, model.tables[0]), model
 
 

@@ -20,7 +20,7 @@ _MOSTLY = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorBars:
-    """Errors of a load's maximum shear strain, or why they are not known."""
+    """Error bars of a load's maximum shear strain, or the reason why there are none."""
 
     uncertainty: Uncertainty | None
     told: str  # where the figures come from, or why there are none; empty where no images were registered
@@ -47,7 +47,7 @@ class ErrorBars:
     @property
     def summary(self) -> list[str]:
         """Why there are none, if images were registered, and what the twin did to them, in lines."""
-        lines = [f"No error bars. {self.told}"] * bool(self.uncertainty is None and self.told)
+        lines = [f"No error bars: {self.told}"] * bool(self.uncertainty is None and self.told)
         return lines + [f"Error bars: {self.of_twin}"] * bool(self.of_twin)
 
 
@@ -74,7 +74,7 @@ def error_bars(
         chosen = _model_for(found, model)
         table = chosen.table_for(_larger_voxel(found), snr)
         if not bone.any():
-            raise InputError("The error depends on the distance to bone, and no bone was given.")
+            raise InputError("The error model needs the distance to bone, but no bone was given.")
     except InputError as reason:
         again = None if twin is None else twin.max_shear
         rows = () if again is None else judged(maps.max_shear, again, regions)
@@ -90,8 +90,8 @@ def error_bars(
     voxel = " x ".join(f"{s:.2g}" for s in table.spacing_mm)
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}: "
-        f"{chosen.source}. Tissues with figures of their own: {known or 'none'}; others take those of soft tissue "
-        f"together. {_held(table)} All this is for tissue that is strained and imaged like those phantoms."
+        f"{chosen.source}. Tissues with their own figures: {known or 'none'}; all others use the pooled figures of "
+        f"soft tissue. {_held(table)} The model applies to tissue that is strained and imaged like these phantoms."
     )
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
 
@@ -101,29 +101,30 @@ def _used(chosen: ErrorModel, table: ErrorTable, wider: Mapping[str, float]) -> 
     if not wider:
         return replace(chosen, tables=(table,))
     most = max(wider.values())
-    source = f"{chosen.source}; intervals made {most:.1f} times wider by the twin of one pair, and for that pair alone"
+    widened = f"intervals widened {most:.1f} times by the synthetic warp of one pair, and valid for that pair alone"
+    source = f"{chosen.source}; {widened}"
     return replace(chosen, tables=(replace(table, widening=most * table.factor),), source=source)
 
 
 def _of_twin(rows: Sequence[Judged], twin: TwinCheck | None) -> str:
     """What the pair's twin did to the error bars, or why there is none; empty where none was asked for."""
     if twin is not None and twin.failure:
-        return f"there is no twin of this pair. {twin.failure}"
+        return f"not checked, because the synthetic warp of this pair has no result. {twin.failure}"
     if not rows:
         return ""
     if all(row.factor is None for row in rows):
         errors = ", ".join(f"{row.region} {row.rms_error:.3f}" for row in rows)
-        return f"not known; the twin of this pair came back with an error (rms) of {errors}."
+        return f"not known. In the synthetic warp of this pair, the error (rms) of the max. shear is {errors}."
     some = ", ".join(f"{row.region} {row.factor:.1f} times" for row in rows if row.factor and row.factor > 1.0)
-    return f"made wider by the twin of this pair: {some}." if some else "they hold in the twin of this pair."
+    return f"{'widened' if some else 'confirmed'} by the synthetic warp of this pair{f': {some}' if some else ''}."
 
 
 def _held(table: ErrorTable) -> str:
     if not np.isfinite(table.widening):
-        return "How often such intervals hold the truth is not known: the study has one heel alone."
+        return "The coverage of these intervals is not known, because the study has only one heel."
     return (
-        f"Intervals are {table.widening:.1f} times as wide as drawn, so that they held 95 % of the true figures when "
-        "heels of the study were judged by the others."
+        f"Intervals are widened {table.widening:.1f} times, so that they contain 95 % of the true figures when each "
+        "heel of the study is compared with a model fitted to the others."
     )
 
 
@@ -134,10 +135,10 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
         raise InputError(used.without_error_model)
     measure = f"`mrstrain accuracy --preset {used.name}`"
     if given is None:
-        raise InputError(f"The error of {used.name} has not been measured; {measure} does that.")
+        raise InputError(f"The error of {used.name} has not been measured. Measure it with {measure}.")
     if given.preset != used.name:
-        both = f"The error model is that of {given.preset}, and {used.name} was used"
-        raise InputError(f"{both}: {measure} measures that.")
+        both = f"The error model is for {given.preset}, but the images were registered with {used.name}"
+        raise InputError(f"{both}. Measure its error with {measure}.")
     if given.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
         raise InputError(used.unlike_its_error_model)
     if found.unlike_study:

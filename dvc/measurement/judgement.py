@@ -41,18 +41,18 @@ class CarriedImages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What a registration is judged by, beside its two images.
+    """Evidence for the verdict on a registration, in addition to its two images.
 
     Attributes
     ----------
     landmarks : ((n, 3), (n, 3)), optional
-        Points of the unloaded image and the same of the loaded one, LPS mm.
+        The same points in the unloaded and in the loaded image, LPS mm.
     noise_floor : NoiseFloor, optional
         Of a repeat scan.
     error_model : ErrorModel, optional
         Of the engine or preset that is used; without one there are no error bars.
     twin : TwinCheck, optional
-        What came back from a synthetic warp of the unloaded image by what was measured.
+        Result of registering a synthetic warp of the unloaded image by the measured displacement.
     """
 
     landmarks: tuple[FloatArray, FloatArray] | None = None

@@ -47,28 +47,29 @@ def measure(
     reference, loaded : Image
         Unloaded and loaded image, each in the frame of its own file (LPS mm).
     bone : Mask, optional
-        The bone whose motion is taken out, on the reference grid; may be missing if ``settings.align_on`` is another.
+        The bone whose motion is removed, on the reference grid; needed if ``settings.align_on`` is "bone", the default.
     tissue : Mask, optional
-        Body on the reference grid, bone included; found by a threshold where it is not given.
+        Body on the reference grid, bone included; by default found by an intensity threshold.
     labels : LabelMap, optional
-        Tissues on the reference grid: statistics by region, and strain discontinuities at their borders.
+        Tissues on the reference grid: statistics by region, and strain discontinuities at tissue interfaces.
     start : Deformation, optional
-        A first guess of the displacement of tissue relative to its bone, such as another load's.
+        First guess of the displacement of tissue relative to its bone, such as that of another load.
     settings : Settings, optional
-        By default Gauss-Newton, with strain discontinuities at tissue interfaces if there are labels; one thread.
+        Default: the Gauss-Newton engine, with strain discontinuities at tissue interfaces if labels are given; one
+        thread.
     repeat : Image, optional
         A second unloaded image: its apparent strain is the noise floor.
     landmarks : ((n, 3), (n, 3)), optional
-        Points of the unloaded image and the same of the loaded one, LPS mm; also as `read_landmarks` returns them.
+        The same points in the unloaded and in the loaded image, LPS mm; also the result of `read_landmarks`.
     error_model : ErrorModel, optional
         By default the one that comes with the engine or preset.
     mesh : MeshFile, optional
-        Displacement and strain are written at its nodes and cells.
+        Mesh at whose nodes and cells displacement and strain are written.
     plate_normal, shear_direction : (3,), optional
-        LPS. The plate's outward normal (default: inferior) finds the bone's lowest point, where pictures cut; with a
-        shear direction, strain is written in the plate's axes as well.
+        LPS. Figures cut through the lowest point of the bone along the plate's outward normal (default: inferior). With
+        a shear direction, strain is also written in the axes of the plate.
     name : str
-        Of the load.
+        Name of the load.
     worker : Worker, optional
         Process to compute in; a new one by default.
     progress : callable, optional
@@ -83,10 +84,10 @@ def measure(
     Raises
     ------
     GeometryError, InputError, ParameterError, RegistrationError, WorkerError
-        As `dvc.register`, and if the labels lie on another grid.
+        As `dvc.register`, and if the labels are on another grid.
     """
     if labels is not None and not labels.grid.same_as(reference.grid):
-        raise GeometryError("The labels lie on another grid than the unloaded image: `fit_mask` brings them onto it.")
+        raise GeometryError("The labels are on another grid than the unloaded image; resample them with `fit_mask`.")
     normal, axes = plate_directions(plate_normal, shear_direction)
     subject = Subject(reference, bone, tissue, labels, mesh, normal, axes)
     chosen = settings or Settings(GaussNewton() if labels is None else GaussNewtonWithInterfaces())

@@ -37,21 +37,21 @@ _SHOWN = "slices_meet_at_lps_mm"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """Deformation and strain of one loaded image against the unloaded one, and how far they may be trusted.
+    """Deformation and strain between the unloaded and one loaded image, with verdict and error bars.
 
-    Everything lies on the unloaded image's voxels, in the reference configuration, LPS mm; NaN where not defined.
+    Everything is on the voxels of the unloaded image, in the reference configuration, LPS mm; NaN where not defined.
 
     Attributes
     ----------
     name : str
-        Of the load.
+        Name of the load.
     deformation : Deformation
         Displacement of tissue relative to its bone.
     maps : StrainMaps
         Displacement, Green-Lagrange strain, maximum shear strain (E1 - E3)/2, det F, and where they are valid.
     alignment : mapping
-        The bone's rigid motion between the scans and how well it is known, as plain values: "on" (what was aligned
-        on), "rotation" (3 x 3) and "translation_lps_mm" (`bone_motion`), "repeatability_rms_mm" and more.
+        The bone's rigid motion between the scans, as plain values: "on" (what was aligned), "rotation" (3 x 3) and
+        "translation_lps_mm" (`bone_motion`), "repeatability_rms_mm" and more.
     quality : Quality
         The figures behind the verdict.
     regions : tuple of RegionRow
@@ -59,11 +59,11 @@ class Measurement:
     error_bars : ErrorBars
         Standard deviation and intervals of the maximum shear strain, or why there are none.
     image : Image or None
-        What maps are shown over: the unloaded image; the registered one where a folder was read.
+        Image below the maps in figures: the unloaded image, or the registered one if read from a folder.
     source : Source or None
-        What it was made from; None where a folder was read.
+        What it was made from; None if read from a folder.
     shown_mm : (3,) or None
-        Where the slices of its pictures meet, LPS mm: the bone's lowest point; None: the middle of the tissue.
+        Point where the slices in figures meet, LPS mm: the lowest point of the bone; None: the middle of the tissue.
 
     Examples
     --------
@@ -104,9 +104,9 @@ class Measurement:
         name: str = "load",
         is_repeat: bool = False,
     ) -> Self:
-        """Judge a registered pair by its subject, the unloaded image, and by more evidence.
+        """Strain, verdict and error bars of a registered pair.
 
-        With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
+        With ``is_repeat`` the loaded image is a repeat scan without load; its strain is the noise floor.
         """
         more = evidence or Evidence()
         # On two cores, as NumPy and SciPy let go of the interpreter; of two at work, only one calls compiled kernels.
@@ -124,13 +124,13 @@ class Measurement:
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Self:
-        """Strain of a deformation that was estimated elsewhere; no images are compared.
+        """Strain of a deformation from another program; no images are compared.
 
         Parameters
         ----------
         whole : Deformation
-            Of points of the unloaded image to points of the loaded one, LPS mm. Of a subject with a bone, the bone's
-            rigid motion (least squares over its voxels) is taken out.
+            Maps points of the unloaded image to points of the loaded one, LPS mm. If the subject has a bone, its rigid
+            motion (least squares over its voxels) is removed.
 
         Raises
         ------
@@ -151,34 +151,34 @@ class Measurement:
         Parameters
         ----------
         folder : path
-            Of one load; a series has one for each.
+            Folder of one load; a series has one for each load.
         image : Image, optional
-            The unloaded image, to show maps over, which the folder does not hold; by default the registered image.
+            The unloaded image, for figures, which is not in the folder; by default the registered image.
 
         Raises
         ------
         InputError, ImageFileError
-            If a file is missing or damaged, with its name and what to do; if the folder is that of a series.
+            If a file is missing or damaged, or the folder is that of a series.
         GeometryError
-            If the image lies on another grid than the maps.
+            If the image is on another grid than the maps.
         """
         place = Path(folder)
         loads = sorted({path.parent.name for path in place.glob(f"*/{files.QUALITY}")} - {files.REPEAT})
         if loads and not (place / files.QUALITY).is_file():
-            raise InputError(f"{place} holds {', '.join(loads)}: read one of them, e.g. {place / loads[0]}.")
+            raise InputError(f"{place} has several loads ({', '.join(loads)}); read one, such as {place / loads[0]}.")
         told = files.read_quality(place)
         try:
             quality, alignment = Quality.from_dict(told), dict(told["alignment"])
             files.motion_in(alignment)
             at = np.array(told[_SHOWN].split(), dtype=np.float64) if told.get(_SHOWN) else None
         except (KeyError, TypeError, ValueError) as failure:
-            what = f"not as `write` leaves it ({failure!r})"
+            what = f"damaged, or not written by `Measurement.write` ({failure!r})"
             raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
         maps = files.read_maps(place)
         uncertainty, model = files.read_uncertainty(place, maps.grid) or (None, None)
         if image is not None and not image.grid.same_as(maps.grid):
-            what = f"The image lies on another grid ({image.grid}) than the maps in {place} ({maps.grid})"
-            raise GeometryError(f"{what}: give the unloaded image that was measured.")
+            what = f"The image is on another grid ({image.grid}) than the maps in {place} ({maps.grid})"
+            raise GeometryError(f"{what}. Pass the unloaded image of that measurement.")
         if image is None and (place / files.REGISTERED).is_file():
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
         regions = tuple(read_regions_csv(place / files.REGIONS))
@@ -192,7 +192,7 @@ class Measurement:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the registration may be trusted, and why (not)."""
+        """The verdict on the registration, with its reasons."""
         return self.quality.verdict
 
     @property
@@ -202,19 +202,19 @@ class Measurement:
 
     @property
     def sigma(self) -> Float32Array | None:
-        """(ni, nj, nk): standard deviation of the maximum shear strain, where its error is known."""
+        """Standard deviation of the maximum shear strain (ni, nj, nk); None without error bars."""
         known = self.error_bars.uncertainty
         return None if known is None else known.sigma
 
     @property
     def intervals(self) -> tuple[Interval, ...]:
-        """95 % intervals of percentiles and volumes above a strain by tissue; empty where the error is not known."""
+        """95 % intervals of percentiles and volumes above a strain, by tissue; empty without error bars."""
         known = self.error_bars.uncertainty
         return () if known is None else known.intervals
 
     @property
     def bone_motion(self) -> RigidMotion:
-        """The bone's motion between the scans, which is taken out of the displacement."""
+        """The bone's motion between the scans, which is removed from the displacement."""
         return files.motion_in(dict(self.alignment))
 
     @property
@@ -244,7 +244,7 @@ class Measurement:
         point_mm: npt.ArrayLike | None = None,
         largest: float | None = None,
     ) -> Figure:
-        """Draw a quantity in colour over the unloaded image; thin white lines are the borders of its labels.
+        """Draw a quantity in colour over the unloaded image; thin white lines are the outlines of its labels.
 
         Parameters
         ----------
@@ -253,16 +253,16 @@ class Measurement:
             strain: "xx", "xy", "xz", "yy", "yz", "zz".
         planes : sequence of {"sagittal", "coronal", "axial"}
         point_mm : (3,), optional
-            LPS mm: where the planes meet; by default the lowest point of the bone, or the middle of the tissue.
+            Point where the planes meet, LPS mm; by default the lowest point of the bone, or the middle of the tissue.
         largest : float, optional
-            End of the colours, in the quantity's unit.
+            Upper end of the colour scale, in the unit of the quantity.
 
         Raises
         ------
         InputError
-            If there is no such quantity or plane, or the standard deviation is asked for and not known.
+            If the quantity or plane is unknown, or "sigma" is requested without error bars.
         GeometryError
-            If the point lies outside the image.
+            If the point is outside the image.
         """
         view, values = self._view(point_mm), self._values_of(quantity)
         outline = None if self.source is None else self.source.subject.labels
@@ -274,11 +274,11 @@ class Measurement:
         if quantity in TENSOR_COMPONENTS:
             return self.maps.green_lagrange[..., TENSOR_COMPONENTS.index(quantity)]
         if quantity == "sigma" and self.sigma is None:
-            raise InputError("sigma: the error of this measurement is not known; its `error_bars` tell why.")
+            raise InputError("sigma: this measurement has no error bars; `error_bars.told` gives the reason.")
         known = self.maps.by_quantity | ({} if self.sigma is None else {"sigma": self.sigma})
         if quantity not in known:
             names = ", ".join((*self.maps.by_quantity, "sigma", *TENSOR_COMPONENTS))
-            raise InputError(f"No quantity '{quantity}'; there are {names}.")
+            raise InputError(f"Unknown quantity '{quantity}'; choose one of {names}.")
         return known[quantity]
 
     def _repr_html_(self) -> str:
@@ -302,24 +302,24 @@ class Measurement:
         return page.pictures_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
 
     def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
-        """Write everything to a folder, whole or not at all; an older folder of that name is replaced.
+        """Write everything to a folder, complete or not at all; an older folder of that name is replaced.
 
         Parameters
         ----------
         folder : path
-            Its parent exists.
+            The parent folder must exist.
         provenance : mapping, optional
-            What it was made from, as plain values, kept as ``provenance.json``.
+            What it was made from, as plain values; written to ``provenance.json``.
 
         Returns
         -------
         Section
-            Its part of a report, with the figures that were written.
+            The section of a report, with the figures that were written.
 
         Raises
         ------
         InputError
-            Of a measurement that was read from a folder: copy that one.
+            For a measurement that was read from a folder; copy that folder instead.
         OutputError
             If it cannot be written.
         """
@@ -358,8 +358,8 @@ class Measurement:
     def _made_from(self) -> Source:
         if self.source is None:
             raise InputError(
-                f"The measurement {self.name} was read from a folder and holds no images to draw or write again: copy "
-                "that folder."
+                f"The measurement {self.name} was read from a folder, so it has no images to draw or write. Copy the "
+                "folder instead."
             )
         return self.source
 

@@ -20,12 +20,12 @@ from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
 SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
 """Upper ends of the colours for maximum shear strain and its standard deviation."""
 _TWIN = (
-    "The unloaded image was moved by what was measured, its noise drawn anew, and the pair registered as the real one: "
-    "its true strain is the one above. What came back tells what the noise and texture of these images cost. Strain "
-    "that a registration smooths away before it is measured does not come back, which makes the twin's error smaller "
-    "than the true one; what denoising takes of the texture makes it larger. A tissue in which fewer voxels lie within "
-    "the claimed error than are expected of any registration, or a percentile does not come back within its interval, "
-    "has its error bars made wider by the factor; none are made narrower."
+    "The unloaded image was warped by the measured displacement, fresh noise was added, and the pair was registered "
+    "like the real one. Its true strain is the measured strain above, so the table shows the error that the noise and "
+    "texture of these images cause. Two caveats: strain that the registration smooths away is missing from the warp, "
+    "which makes this error smaller than the true one; denoising removes texture, which makes it larger. Error bars of "
+    "a tissue are widened by the factor where fewer voxels than expected lie within the claimed error, or where a "
+    "percentile falls outside its interval. They are never narrowed."
 )
 
 
@@ -43,12 +43,12 @@ def pictures_of(
         local = view, images.local_rigid, images.local_after
         drawn["overlay"] = Picture.drawn("Before and after", figures.overlay, *pair)
         drawn["checkerboard"] = Picture.drawn("Checkerboard", figures.checkerboard, *pair)
-        drawn["similarity"] = Picture.drawn("Where the images agree", figures.similarity_slices, *local)
+        drawn["similarity"] = Picture.drawn("Local similarity of the images", figures.similarity_slices, *local)
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
-    through = "Slices through the bone's lowest point along the plate's normal."
+    through = "Slices through the lowest point of the bone along the plate normal."
     drawn["strain"] = Picture.drawn("Maximum shear strain", figures.strain_slices, *strain, note=through)
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
-    drawn["curves"] = Picture.drawn("Volume above a strain", figures.shear_curves, *curves)
+    drawn["curves"] = Picture.drawn("Strain-volume curves", figures.shear_curves, *curves)
     grid = view, below, maps.displacement_mm, None if bone is None else bone.inside
     drawn["deformed_grid"] = Picture.drawn("Deformed grid", figures.deformed_grid, *grid)
     drawn["jacobian"] = Picture.drawn("Volume ratio", figures.jacobian_slices, view, reference, maps.jacobian)
@@ -59,10 +59,10 @@ def pictures_of(
 
 
 def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
-    """What the verdict rests on."""
+    """The figures that the verdict is based on."""
     rows = [("Rotation of the bone between the scans", alignment["rotation_deg"], "degrees")]
     if "bone_shift_lps_mm" in alignment:
-        spread = "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)"
+        spread = "Spread of the rigid alignment between halves of the bone (rms over the bone; largest of six pairs)"
         spacing = " x ".join(f"{s:.3g}" for s in alignment["control_spacing_mm"])
         rows += [
             ("Shift of the bone between the scans", float(np.linalg.norm(alignment["bone_shift_lps_mm"])), "mm"),
@@ -70,15 +70,15 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
             ("Correlation in and around the bone, after alignment", alignment["similarity"], ""),
             (spread, alignment["repeatability_rms_mm"], "mm"),
             ("Engine of the non-rigid registration", alignment["engine"], ""),
-            ("Spacing of the B-spline's control points", spacing, "mm"),
+            ("Control point spacing of the B-spline", spacing, "mm"),
         ]
     if quality.similarity is not None:
-        each = zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True)
+        each = zip(("as scanned", "after rigid alignment", "after registration"), quality.similarity, strict=True)
         rows += [(f"Local similarity in the tissue, {said}", float(value), "") for said, value in each]
-        rows.append(("Local similarity that noise as in the air allows, about", quality.most_similarity, ""))
-    bone = "in the bone, before it was held at rest" if quality.bone_held else "left in the bone"
+        rows.append(("Highest local similarity that noise as in the air allows, about", quality.most_similarity, ""))
+    bone = "in the bone, before it was made rigid" if quality.bone_held else "in the bone"
     rows += [
-        (f"Displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
+        (f"Apparent displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
         (f"Apparent maximum shear strain {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
         ("Folded voxels (det F <= 0)", quality.folded_voxels, "voxels"),
         ("Lowest det F", quality.lowest_jacobian, ""),
@@ -95,16 +95,16 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
         rows += [
             ("Noise floor (repeat scan): maximum shear strain, median", floor.max_shear_p50, ""),
             ("Noise floor (repeat scan): maximum shear strain, 95th percentile", floor.max_shear_p95, ""),
-            ("Noise floor: mean absolute strain component (MAER), mean over voxels", floor.maer, ""),
-            ("Noise floor: standard deviation of the same (SDER)", floor.sder, ""),
+            ("Noise floor (repeat scan): mean absolute strain component, mean over voxels (MAER)", floor.maer, ""),
+            ("Noise floor (repeat scan): the same, standard deviation over voxels (SDER)", floor.sder, ""),
         ]
     return Table("Key figures", ("figure", "value", "unit"), tuple(rows))
 
 
 def weights_table(choice: Regularisation) -> Table:
-    """The weights of the prior, and what those that were tried left of half of the voxels."""
-    columns = ("penalty on", "weight", "unit", "residual left out, % above the least")
-    return Table("Weights of the registration", columns, tuple(choice.rows()), choice.caption)
+    """The regularisation weights that were used, and the residual of those tried in the voxels left out of the fit."""
+    columns = ("penalty on", "weight", "unit", "residual in the voxels left out, % above the lowest")
+    return Table("Regularisation weights", columns, tuple(choice.rows()), choice.caption)
 
 
 def region_table(regions: Sequence[RegionRow]) -> Table:
@@ -117,7 +117,7 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     above = (f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
     columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99", *above)
-    note = "Maximum shear strain (E₁ − E₃)/2 (Green-Lagrange), and volumes above a value."
+    note = "Maximum shear strain (E₁ − E₃)/2 (Green-Lagrange), and the volume in which it exceeds a value."
     return Table("Maximum shear strain by region", columns, rows, note)
 
 
@@ -150,18 +150,19 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
 
 
 def error_tables(bars: ErrorBars) -> list[Table]:
-    """The intervals, and what came back from the twin."""
+    """The intervals, and the errors in the synthetic warp."""
     tables = []
     if bars.uncertainty is not None:
         rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
-        columns = ("region", "figure", "as found", "95 % from", "to")
-        tables.append(Table("Maximum shear strain with its error", columns, rows, bars.told))
+        columns = ("region", "figure", "measured", "95 % interval from", "to")
+        tables.append(Table("Maximum shear strain with 95 % intervals", columns, rows, bars.told))
     if bars.twin:
         claims = bars.uncertainty is not None
-        head = ("region", "error (rms)", "bias", *(("within the claim", "expected, at least", "wider") * claims))
+        claimed = ("voxels within the claimed error", "expected at least", "intervals widened, times")
+        head = ("region", "error (rms)", "bias", *(claimed * claims))
         beside = ((f"{row.held:.0%}", f"{row.expected:.0%}", row.factor) if claims else () for row in bars.twin)
         lines = tuple((row.region, row.rms_error, row.bias, *more) for row, more in zip(bars.twin, beside, strict=True))
-        tables.append(Table("The twin of this pair, measured again", head, lines, _TWIN))
+        tables.append(Table("Check by a synthetic warp of this pair (twin)", head, lines, _TWIN))
     return tables
 
 

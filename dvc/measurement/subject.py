@@ -31,9 +31,9 @@ class Subject:
     bone, tissue, labels : Mask, Mask, LabelMap or None
         On the reference grid.
     plate_normal : (3,)
-        The plate's outward unit normal, away from the foot, LPS.
+        The plate's outward unit normal, away from the body, LPS.
     axes : (3, 3) or None
-        Columns: plate normal, shear direction, and the third; where a shear direction was given.
+        Columns: plate normal, shear direction, and their cross product; None without a shear direction.
     files : dict
         Role to the file it came from, for provenance; empty where arrays were given.
     """
@@ -49,7 +49,7 @@ class Subject:
 
     @property
     def lowest_bone_point_mm(self) -> FloatArray | None:
-        """The bone's voxel that lies furthest along the plate's outward normal, LPS mm."""
+        """The voxel of the bone that is furthest along the plate's outward normal, LPS mm."""
         if self.bone is None:
             return None
         points = self.bone.points()
@@ -85,7 +85,7 @@ def _unit(name: str, vector: Sequence[float]) -> FloatArray:
     length = float(np.linalg.norm(direction))
     if direction.shape != (3,) or not np.isfinite(length) or length < 1e-6:
         told = f"{name} (--{name.replace('_', '-')} on the command line)"
-        raise InputError(f"{told} must be three finite numbers (LPS) that are not all zero; got {list(vector)}.")
+        raise InputError(f"{told} must be three finite numbers (LPS), not all zero; got {list(vector)}.")
     return direction / length
 
 

@@ -47,14 +47,14 @@ _INVERTED_TRIES = 7
 _CLEARLY = 0.1
 
 _OTHER_MEASURE = (
-    "the two images have different contrast (water against fat, say). Correlation cannot follow that; mutual "
-    'information could: a parameter file with (Metric "AdvancedMattesMutualInformation")'
+    "their contrast differs, as between water and fat images. Correlation cannot match them, but mutual information "
+    'could: use a parameter file with (Metric "AdvancedMattesMutualInformation")'
 )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The rigid motion of the bone between two scans, and how well it is known.
+    """The rigid motion of the bone between two scans, and its repeatability.
 
     Attributes
     ----------
@@ -65,8 +65,8 @@ class Alignment:
     similarity_before, similarity : float
         Normalised correlation in and 2 mm around the bone (over the whole mask with "image"), before and after.
     repeatability_mm : float
-        Root mean square, over the bone's voxels, of the distance between the motions that two halves of them give,
-        begun apart; the largest of six pairs. NaN with "none".
+        Distance between the motions fitted to two halves of the bone's voxels from different starts: root mean square
+        over the bone, largest of six pairs. NaN with "none".
     bone_shift_mm : (3,)
         Displacement of the bone's centroid, LPS.
     """
@@ -100,8 +100,8 @@ def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion
     _, found = local_correlation(reference, carry(loaded, reference.grid, motion), tissue)
     if found < -_CLEARLY:
         raise RegistrationError(
-            f"The local correlation of the two images in the tissue is {found:.2f} before the non-rigid registration, "
-            f"below zero: {_OTHER_MEASURE}, for --parameters."
+            f"The images correlate negatively in the tissue (local correlation {found:.2f}) before the non-rigid "
+            f"registration: {_OTHER_MEASURE} (--parameters)."
         )
 
 
@@ -114,23 +114,24 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     like the bone, if the contrast is inverted, or if the fits of two halves disagree by more than 0.5 mm.
     """
     if not mask.inside.any():
-        raise InputError("The mask to align on is empty.")
+        raise InputError("The mask for the rigid alignment is empty.")
     fit, likeness = RigidFit(reference, loaded, mask, seed), _Likeness(reference, loaded, mask)
     starts, highest = _search(reference, loaded, mask)
     score, best = _best(fit, likeness, [*starts, RigidMotion.identity()])
     if score < _LOWEST_SIMILARITY:
         raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
     points = mask.points()
-    advice = f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
-    advice += "inside the loaded one."
+    advice = f"so the position of the {on} is uncertain. Check that the mask covers it on the unloaded image and that "
+    advice += "all of it is in the loaded image."
     try:
         pairs = fit.halves(best)
     except RegistrationError as why:
-        raise RegistrationError(f"A half of the {on} cannot be fitted by itself ({why}): {advice}") from why
+        reason = str(why).rstrip(".")
+        raise RegistrationError(f"A half of the {on} could not be fitted separately ({reason}), {advice}") from why
     spread = max(apart_mm(one, other, points) for one, other in pairs)
     if not spread <= _LARGEST_SPREAD_MM:
         raise RegistrationError(
-            f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): {advice}"
+            f"Two rigid fits on the {on} differ by {spread:.2f} mm (limit {_LARGEST_SPREAD_MM} mm), {advice}"
         )
     centroid, halves = points.mean(axis=0)[None], [half for pair in pairs for half in pair]
     R = Rotation.from_matrix(np.stack([half.rotation for half in halves])).mean().as_matrix()
@@ -145,7 +146,7 @@ def motion_of(deformation: Deformation, mask: Mask) -> RigidMotion:
     x = X + deformation.displacement(X)
     known = np.isfinite(x).all(axis=1)
     if np.count_nonzero(known) < 4:
-        raise InputError("The deformation is not defined in the bone, so its motion cannot be taken away.")
+        raise InputError("The deformation is not defined in the bone, so the bone's motion cannot be removed.")
     X, x = X[known], x[known]
     rotation, _ = Rotation.align_vectors(x - x.mean(axis=0), X - X.mean(axis=0))
     R = rotation.as_matrix()
@@ -202,18 +203,18 @@ class _Likeness:
 def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highest: float, on: AlignOn) -> str:
     tries = _scored(reference, loaded, mask, _rotations()[:_INVERTED_TRIES], sign=-1.0)
     inverted = max((score for score, _ in tries), default=0.0)
-    found = "nowhere does the loaded image look like it"
+    found = "no position in the loaded image matches it"
     if np.isfinite(score):
-        found = f"the best normalised correlation found around it is {score:.2f}"
+        found = f"the best normalised correlation around it is {score:.2f}"
     told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
     if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
         return (
-            f"{told} With the contrast turned round it is {inverted:.2f}: {_OTHER_MEASURE}, with --align none where "
-            "the images share a frame."
+            f"{told} With inverted contrast it is {inverted:.2f}: {_OTHER_MEASURE} and --align none, if the images "
+            "share a frame."
         )
     return (
-        f"{told} Check that both images show the same foot, that the mask covers the bone on the unloaded image, "
-        "and that the bone lies wholly inside the loaded one; or use --align image, or --align none."
+        f"{told} Check that both images show the same body part, that the mask covers the bone on the unloaded image, "
+        "and that all of the bone is in the loaded image; or use --align image or --align none."
     )
 
 

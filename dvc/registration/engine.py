@@ -22,20 +22,20 @@ _CROP_VOXELS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedPair:
-    """Two images between which a displacement is sought, the rigid motion of the bone already taken out.
+    """An image pair to be registered, with the rigid motion of the bone already removed.
 
     Attributes
     ----------
     fixed : Image
         Unloaded image, without its bias field. Voxels may be missing (NaN).
     moving : Image
-        Loaded image, likewise; the bone's motion is taken out by its grid alone, so nothing is resampled.
+        Loaded image, likewise. The bone's motion is removed by changing its grid, so nothing is resampled.
     compared : Mask
         Voxels of ``fixed`` to compare.
     body : Mask
         Tissue on the grid of ``fixed``, bone included.
     bone : Mask or None
-        The bone that the images are aligned on, on the same grid: it is rigid. None where they are not aligned on bone.
+        The rigid bone of the alignment, on the same grid. None if the images are not aligned on a bone.
     labels : LabelMap or None
         Tissues on the same grid, for an engine that needs them.
     """
@@ -82,7 +82,7 @@ class Displacement(Deformation, Protocol):
 
 
 class Regularisation:
-    """How strongly an engine smoothed a pair, and why; as it is here for an engine that decides nothing for a pair."""
+    """The regularisation weights of a pair, and why; this one is for an engine that chooses no weights by pair."""
 
     @property
     def in_bone(self) -> tuple[float, float] | None:
@@ -130,16 +130,16 @@ class Cost:
 
 
 class Engine(Protocol):
-    """An engine with its parameters, which finds the non-rigid part of a registration."""
+    """An engine of the non-rigid registration, with its parameters."""
 
     family: ClassVar[str]
     """The name by which ``--engine`` and results know it."""
     needs_labels: ClassVar[bool] = False
     """Whether it needs a label map of the tissues."""
     sees_brightness: ClassVar[bool] = True
-    """Whether an even offset of brightness between the images misleads it, as it does not mislead correlation."""
+    """Whether a constant offset in brightness between the images misleads it; it does not mislead correlation."""
     starts_anywhere: ClassVar[bool] = True
-    """Whether it can start from any displacement, or from results of its own alone."""
+    """Whether it can start from any displacement; otherwise only from its own results."""
     cost: ClassVar[Cost] = Cost()
     """Time, memory and disk space that it takes."""
     note: ClassVar[str] = ""
@@ -151,42 +151,42 @@ class Engine(Protocol):
 
     @property
     def text(self) -> str:
-        """Every parameter that decides the result; an error model holds for one such text."""
+        """Every parameter that affects the result; an error model is valid for one such text."""
 
     @property
     def needs_one_contrast(self) -> bool:
-        """Whether what is brighter than its neighbours must be so in both images."""
+        """Whether the two images must have the same contrast."""
         return True
 
     @property
     def seeds(self) -> int:
-        """How many independent seeds it draws random numbers from."""
+        """Number of independent random seeds."""
         return 0
 
     @property
     def without_error_model(self) -> str:
-        """Why no error model can be made for it; empty where one can."""
+        """Why there can be no error model for it; empty if there can be one."""
         return ""
 
     @property
     def unlike_its_error_model(self) -> str:
-        """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
+        """Why the error model of this name is not valid, if it was made with other parameters."""
         return other_parameters(self.name)
 
     def of_repeat(self) -> Self:
-        """The engine for a repeat scan: it must smooth no more than it smooths a loaded pair."""
+        """The engine for a repeat scan, which must not smooth more than for a loaded pair."""
         return self
 
     def keeping_volume(self) -> Self:
-        """The engine for tissue that is known to keep its volume."""
+        """The engine for tissue that is known to be incompressible."""
         return self
 
     def check_start(self, start: Deformation) -> None:
-        """Refuse, by InputError, an earlier result from which it cannot start."""
+        """InputError for an earlier result from which it cannot start."""
         return
 
     def prepare(self) -> None:
-        """Do what only a first run on a machine needs; a process does it while its worker aligns the images."""
+        """Prepare the first run on a machine (compilation); done in parallel with the rigid alignment."""
         return
 
     def record(self) -> dict[str, object]:
@@ -194,18 +194,18 @@ class Engine(Protocol):
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
         return ""
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
     ) -> Found:
-        """Find the displacement that carries the fixed image to the moving one.
+        """Find the displacement that maps the fixed image onto the moving one.
 
         Parameters
         ----------
         start : Deformation or None
-            First guess, u in mm LPS, that `check_start` let pass.
+            First guess, u in mm LPS, accepted by `check_start`.
         seeds : sequence of int
             As many as `seeds`.
         worker : Worker
@@ -224,4 +224,4 @@ class Engine(Protocol):
 
 def other_parameters(name: str) -> str:
     """Why an error model does not hold for an engine of its name whose parameters are others."""
-    return f"The error of {name} was measured with other parameters; `mrstrain accuracy` measures that of yours."
+    return f"The error of {name} was measured with other parameters; measure yours with `mrstrain accuracy`."

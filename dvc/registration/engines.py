@@ -34,7 +34,7 @@ def engine_named(name: str) -> Engine:
         return Elastix((read_parameter_file(name),))
     if name not in preset_names():
         known = ", ".join((*ENGINES, *preset_names()))
-        raise ParameterError(f"No engine or preset '{name}'; there are {known}, or a parameter file of elastix (.txt).")
+        raise ParameterError(f"Unknown engine or preset '{name}'; use {known}, or an elastix parameter file (.txt).")
     return Elastix((load_preset(name),))
 
 

@@ -39,14 +39,14 @@ class Settings:
     Attributes
     ----------
     engine : Engine
-        What finds the non-rigid part, with its parameters.
+        Engine of the non-rigid registration, with its parameters.
     align_on : {"bone", "image", "none"}
         What is aligned rigidly first.
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. What the Gauss-Newton engine finds, the bone's alignment and the correction of the bias
-        field are equal bit for bit on any number of threads; what elastix finds, on equal numbers.
+        Threads of each worker. The Gauss-Newton engine, the rigid alignment and the bias field correction give the same
+        result bit for bit on any number of threads; elastix only on equal numbers of threads.
 
     Raises
     ------
@@ -61,15 +61,15 @@ class Settings:
 
     def __post_init__(self) -> None:
         if not hasattr(self.engine, "of_repeat"):
-            raise ParameterError(f"`engine` is an Engine; for one by its name: Settings.of({self.engine!r}).")
+            raise ParameterError(f"`engine` must be an Engine; for an engine by name use Settings.of({self.engine!r}).")
         check("threads", self.threads, int)
         if self.align_on not in get_args(AlignOn):
-            raise ParameterError(f"`align_on` is one of {', '.join(get_args(AlignOn))}; got {self.align_on!r}.")
+            raise ParameterError(f"`align_on` must be {' or '.join(get_args(AlignOn))}; got {self.align_on!r}.")
         if self.threads < 1:
-            raise ParameterError(f"`threads` is 1 or more; got {self.threads}.")
+            raise ParameterError(f"`threads` must be 1 or more; got {self.threads}.")
 
     def of_repeat(self) -> Self:
-        """The settings for a repeat scan, which is smoothed no more than a loaded image."""
+        """The settings for a repeat scan, which must not be smoothed more than a loaded image."""
         return replace(self, engine=self.engine.of_repeat())
 
     @classmethod
@@ -99,9 +99,9 @@ class Registration:
     seconds : float
         Wall time.
     choice : Regularisation
-        How strongly the engine smoothed, and why.
+        The regularisation weights that the engine used, and why.
     unlike_study : str
-        Why an error model of the engine does not hold for this pair; empty where it does.
+        Why the engine's error model does not apply to this pair; empty where it does.
     """
 
     reference: Image
@@ -137,11 +137,11 @@ def register(
     Parameters
     ----------
     reference, loaded, bone, tissue, labels, settings, worker, progress
-        As in `dvc.measure`. Labels are needed by an engine that lets strain jump at their interfaces, and unused by the
-        others; by default that is gauss-newton without them, on one thread.
+        As in `dvc.measure`. Only an engine with strain discontinuities at tissue interfaces uses labels, and needs
+        them. Default settings: gauss-newton without interfaces, on one thread.
     start : Deformation, optional
-        Result of another load (its ``displacement``) to start from: the first guess, which the registration then
-        corrects against these two images, so no error is carried on. elastix starts from a `BSpline` alone.
+        First guess, such as the ``displacement`` of another load. It is then fitted to these two images, so its errors
+        do not accumulate. elastix can start only from a `BSpline`.
 
     Returns
     -------
@@ -222,24 +222,24 @@ def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
     for (one, image), (other, second) in combinations(images, 2):
         if image.grid.same_as(second.grid) and np.array_equal(image.values, second.values, equal_nan=True):
             raise InputError(
-                f"{one} and {other} are the same image: every voxel is equal. Check the file names; two scans, even "
-                "of a resting foot, differ by their noise."
+                f"{one} and {other} are the same image: all voxels are equal. Check the file names. Two scans always "
+                "differ by their noise, even without load."
             )
 
 
 def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | None, settings: Settings) -> None:
     if settings.align_on == "bone" and bone is None:
         raise InputError(
-            "Alignment on bone needs a mask on the unloaded image: give bone (--bone on the command line), or align on "
-            "something else: Settings(align_on='image') or 'none' (--align)."
+            "Alignment on bone needs a bone mask on the unloaded image: bone (--bone on the command line). Without a "
+            "bone, use Settings(align_on='image') or 'none' (--align)."
         )
     if settings.engine.needs_labels and labels is None:
-        raise InputError("Strain discontinuities need a label map with their interfaces: give labels (--labels), too.")
+        raise InputError("Strain discontinuities at tissue interfaces need a label map: labels (--labels).")
     for name, given in (("tissue mask", body), ("bone mask", bone), ("label map", labels)):
         if given is None:
             continue
         if not given.grid.same_as(reference.grid):
-            raise InputError(f"The {name} is not on the unloaded image's grid; bring it there (fit_mask).")
+            raise InputError(f"The {name} is not on the grid of the unloaded image; resample it with fit_mask.")
         if not (given.labels if isinstance(given, LabelMap) else given.inside).any():
             raise InputError(f"The {name} is empty.")
 

@@ -78,9 +78,10 @@ class RigidFit:
         known = _surrounded(reference, mask)
         points = known.points()
         if min(mask.grid.shape) < 2:
-            raise InputError("The unloaded image is a single slice: a motion in space takes a volume to align.")
+            raise InputError("The unloaded image is a single slice; the rigid alignment needs a volume.")
         if len(points) < _LEAST_VOXELS:
-            raise InputError(f"The unloaded image shows {len(points)} voxels of the mask: too few to align on.")
+            shown = f"Only {len(points)} voxels of the mask are in the unloaded image"
+            raise InputError(f"{shown}; the rigid alignment needs at least {_LEAST_VOXELS}.")
         self._centre = points.mean(axis=0)
         self._radius_mm = float(np.sqrt(np.mean(np.sum((points - self._centre) ** 2, axis=1))))
         self._block_mm = max(min(_BLOCK_MM, _BLOCK_SHARE * self._radius_mm), float(mask.grid.spacing_mm.max()))
@@ -101,7 +102,7 @@ class RigidFit:
         """
         motion = self._settled(start, self._levels, [np.ones(len(level.points), bool) for level in self._levels])
         if (moved_mm := apart_mm(motion, start, self._levels[0].points)) > _FARTHEST_MM:
-            raise RegistrationError(f"The fit went off by {moved_mm:.0f} mm.")
+            raise RegistrationError(f"The rigid fit moved {moved_mm:.0f} mm away from its start.")
         return motion
 
     def halves(self, near: RigidMotion) -> list[tuple[RigidMotion, RigidMotion]]:
@@ -167,11 +168,11 @@ class RigidFit:
         if self._gaps is not None:
             shown &= sampled(self._gaps.values, self._gaps.grid, level.points, motion, order=1) < 1e-6
         if np.count_nonzero(shown) < _LEAST_SHOWN * len(shown):
-            raise RegistrationError("The bone leaves the loaded image.")
+            raise RegistrationError("The bone is moved out of the loaded image.")
         level, carried = level.part(shown), carried[shown]
         values, places, changes = level.values, level.places, level.changes
         if not ((values - values.mean()) * (carried - carried.mean())).sum() > 0.0:
-            raise RegistrationError("What is brighter in the unloaded image is not brighter in the loaded one.")
+            raise RegistrationError("The contrast of the loaded image is inverted.")
         both = values, level.around
         columns, by = (np.column_stack([places * seen[:, None], np.ones(len(seen))]) for seen in both)
         found = _regressed(columns, carried, by)

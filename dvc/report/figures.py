@@ -56,11 +56,11 @@ _HIGHEST_SHEAR = 0.6
 
 
 def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
-    """Unloaded image in green and loaded image in magenta: after the rigid alignment, and after all.
+    """Unloaded image in green, loaded image in magenta; before and after the non-rigid part of the registration.
 
-    Where both agree the picture is grey, but for a faint tint over whole regions where the scans' bias fields differ; a
-    coloured rim is a border that lies elsewhere in the other image. Yellow marks: where the other planes cut.
-    Dark blue: the loaded scan does not show this place.
+    Grey: both images agree. A faint tint over a whole region comes from different bias fields. A coloured rim is an
+    edge that is at another position in the other image. Yellow marks show where the other planes cut. Dark blue: not
+    in the loaded image.
     """
     sheet = Sheet(view, _STAGES)
     for plane, axes, green, magenta in _beside(sheet, reference, (rigid, registered)):
@@ -71,9 +71,9 @@ def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float
 
 
 def checkerboard(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
-    """Fields of 12 mm in turn from the unloaded and the loaded image: after the rigid alignment, and after all.
+    """Squares of 12 mm, alternately from the unloaded and the loaded image; before and after the non-rigid part.
 
-    Where the registration is right, borders run on across the fields without a step.
+    Where the registration is correct, edges continue across the squares without a step.
     """
     sheet, spacing = Sheet(view, _STAGES), view.grid.toward_lps().spacing_mm
     for plane, axes, a, b in _beside(sheet, reference, (rigid, registered)):
@@ -103,15 +103,15 @@ def strain_slices(
 ) -> bytes:
     """Maximum shear strain (E1 - E3)/2 in colour over the unloaded image, in the reference configuration.
 
-    Thin white lines are the borders of the regions. The image stays plain grey where there is no result.
+    Thin white lines are the outlines of the regions. Grey: no result.
     """
     return coloured(view, reference, max_shear, Scale.of("max_shear", max_shear, largest), outline=outline).png()
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
-    """Standard deviation of the maximum shear strain in colour over the unloaded image, by the preset's error model.
+    """Standard deviation of the maximum shear strain in colour over the unloaded image, from the error model.
 
-    The image stays plain grey where there is no result, and in bone.
+    Grey: bone, or no result.
     """
     return coloured(view, reference, sigma, Scale.of("sigma", sigma, largest)).png()
 
@@ -129,7 +129,7 @@ class Scale:
     def of(cls, quantity: str, values: Values, largest: float | None = None) -> Self:
         """Colours of a quantity, to ``largest`` (positive), or to a round number that 99 % of its values lie within."""
         if largest is not None and not largest > 0.0:
-            raise InputError(f"The end of the colours must be positive; got {largest}.")
+            raise InputError(f"The upper end of the colour scale (largest) must be positive; got {largest}.")
         component = f"Green-Lagrange strain, component {quantity} in LPS, no unit", "PuOr_r"
         told, shades = _COLOURS.get(quantity, component)
         if quantity == "jacobian":
@@ -164,7 +164,7 @@ def coloured(
     """A scalar in colour over an image, where there is one, in some planes or one; not yet finished."""
     chosen: tuple[Plane, ...] = (planes,) if isinstance(planes, str) else tuple(planes)  # type: ignore[assignment]
     if not chosen or any(plane not in PLANES for plane in chosen):
-        raise InputError(f"Planes are among {', '.join(PLANES)}; got {', '.join(map(str, chosen)) or 'none'}.")
+        raise InputError(f"Planes must be from {', '.join(PLANES)}; got {', '.join(map(str, chosen)) or 'none'}.")
     sheet = Sheet(view, [""], chosen, bar=True)
     colours, norm = colormaps[scale.shades], Normalize(scale.low, scale.high)
     window = (0.0, 1.0) if image is None else window_of(view, image.values)
@@ -183,9 +183,9 @@ def coloured(
 
 
 def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> bytes:
-    """Volume ratio det F in colour over the unloaded image: purple shrinks, orange grows, white keeps its volume.
+    """Volume ratio det F in colour over the unloaded image: purple shrinks, orange expands, white keeps its volume.
 
-    Red, with the number of voxels, is where the deformation folds (det F <= 0): no result can be trusted there.
+    Red, with the number of voxels: the deformation folds (det F <= 0). Do not trust any result there.
     """
     sheet = coloured(view, reference, jacobian, Scale.of("jacobian", view.shown(jacobian)))
     for plane, axes in sheet.rows[0].items():
@@ -207,9 +207,9 @@ def volume_reach(jacobian: Values) -> float:
 
 
 def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array) -> bytes:
-    """Local correlation of the loaded with the unloaded image: after the rigid alignment, and after all.
+    """Local correlation of the loaded with the unloaded image; before and after the non-rigid part.
 
-    Yellow: alike. Dark: not alike, or a place without any structure that could be compared.
+    Yellow: similar. Dark: different, or without structure to compare.
     """
     sheet = Sheet(view, _STAGES, bar=True)
     shades, norm = colormaps["cividis"], Normalize(0.0, 1.0)
@@ -218,18 +218,18 @@ def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array)
             page = np.ma.masked_invalid(view.cut(values, plane))
             sheet.paint(plane, axes, page, cmap=shades, norm=norm, interpolation="nearest")
     below = any(bool((view.shown(values) < 0.0).any()) for values in (rigid, registered))
-    sheet.bar(shades, norm, "local correlation (1: alike), no unit", "min" if below else "neither")
+    sheet.bar(shades, norm, "local correlation (1: identical), no unit", "min" if below else "neither")
     return sheet.png()
 
 
 def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Array, bone: BoolArray | None) -> bytes:
-    """Material lines over the loaded image, whose bone (orange) lies on that of the unloaded one.
+    """Material lines over the loaded image, aligned on the bone (orange).
 
-    Unloaded, the lines are straight and 5 mm apart; the measured displacement carries them, and they should follow
-    the tissue that is seen below. Only the two components in the plane are drawn; lines end where there is no result.
+    Without load the lines are straight and 5 mm apart. The measured displacement moves them; they should follow the
+    tissue in the image. Only the two in-plane components are drawn. Lines end where there is no result.
     """
     if displacement_mm.shape[3:] != (3,):
-        raise GeometryError(f"A displacement needs three components per voxel; got shape {displacement_mm.shape}.")
+        raise GeometryError(f"A displacement must have three components per voxel; got shape {displacement_mm.shape}.")
     planes: tuple[Plane, ...] = ("sagittal", "coronal")
     sheet = Sheet(view, [""], planes)
     window = window_of(view, aligned)
@@ -268,10 +268,10 @@ def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[Flo
 
 
 def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float | None = None) -> bytes:
-    """Volume of each region whose maximum shear strain exceeds a value, mL: the exact step curve, without bins.
+    """Volume of each region, mL, in which the maximum shear strain exceeds a value: exact step curves, without bins.
 
-    Both panels show the same curves; the logarithmic axis opens up the small volumes at high strain.
-    The legend tells the share of a region that has no result; its curve is a lower bound.
+    Both panels show the same curves; the logarithmic axis resolves the small volumes at high strain. The legend gives
+    the fraction of a region without a result; the curve of such a region is a lower bound.
     """
     figure, panels = chart(2, page_wide=True)
     at = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure; each ordinate is exact
@@ -291,8 +291,8 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
     panels[1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
     for axes, scale in zip(panels, ("linear", "logarithmic"), strict=True):
         axes.set_xlim(0.0, _HIGHEST_SHEAR)
-        axes.set_title(f"Volume above a strain, {scale} axis", loc="left", color=INK, fontsize=10)
-        label_axes(axes, MAX_SHEAR, "volume above, mL")
+        axes.set_title(f"Strain-volume curve, {scale} axis", loc="left", color=INK, fontsize=10)
+        label_axes(axes, MAX_SHEAR, "volume above this strain, mL")
         if noise_floor is not None:
             axes.axvspan(0.0, noise_floor, color="#9aa5b1", alpha=0.35, linewidth=0, label="below the noise floor")
     panels[0].set_ylim(bottom=0.0)

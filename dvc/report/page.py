@@ -51,7 +51,7 @@ class Picture:
 
     def __post_init__(self) -> None:
         if not self.png.startswith(_PNG_SIGNATURE):
-            raise InputError(f"The figure '{self.title}' is no PNG file; it begins with {self.png[:8]!r}.")
+            raise InputError(f"The figure '{self.title}' is not a PNG file; it begins with {self.png[:8]!r}.")
 
     @classmethod
     def drawn(cls, title: str, draw: Callable[..., bytes], *shown: object, note: str = "") -> Self:
@@ -90,8 +90,8 @@ class Table:
     def __post_init__(self) -> None:
         for number, row in enumerate((*self.rows, *self.apart)):
             if len(row) != len(self.columns):
-                what = f"Row {number} of the table '{self.title}' has {len(row)} cells, its header {len(self.columns)}"
-                raise InputError(f"{what}; give one for each column.")
+                what = f"Row {number} of the table '{self.title}' has {len(row)} cells; the table has"
+                raise InputError(f"{what} {len(self.columns)} columns.")
 
     @property
     def numeric(self) -> tuple[bool, ...]:

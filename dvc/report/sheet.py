@@ -73,8 +73,8 @@ class View:
         lps = grid.toward_lps()
         point = np.asarray(point_mm, dtype=np.float64)
         if point.shape != (3,) or not bool(lps.contains(point)):
-            where = f"LPS {point.tolist()} mm, lies outside the grid: {grid}"
-            raise GeometryError(f"The point to be shown, {where}. Give a point inside the image.")
+            where = f"LPS {point.tolist()} mm, is outside the image ({grid})"
+            raise GeometryError(f"The point to show, {where}. Choose a point inside.")
         nearest = np.clip(np.rint(lps.indices_of(point)), 0, np.array(lps.shape) - 1).astype(int)
         spans = [slice(0, n) for n in lps.shape]
         if around is not None and around.any():
@@ -94,8 +94,8 @@ class View:
     def shown(self, values: Values) -> Values:
         """The part of an array inside the box, axes closest to L, P, S; GeometryError for one of another shape."""
         if values.shape[:3] != self.grid.shape:
-            shapes = f"of shape {values.shape} cannot be shown on a grid of {self.grid.shape}"
-            raise GeometryError(f"An array {shapes}; bring it there first.")
+            shapes = f"of shape {values.shape} cannot be shown on a grid of shape {self.grid.shape}"
+            raise GeometryError(f"An array {shapes}; resample it to that grid first.")
         return reordered_to_lps(self.grid, values)[self.box]
 
     def extent_mm(self, plane: Plane) -> tuple[float, float, float, float]:

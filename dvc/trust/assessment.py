@@ -11,7 +11,7 @@ from dvc.images.image import Grid, Mask
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
 
-_NOISIER = " even if the noise is half as strong again"
+_NOISIER = " even at 1.5 times this noise"
 # Where a figure lowers the verdict: use with care, do not trust; one whose second limit is the lower has to lie above.
 # Beside the limits: decimals and unit of the figure in the sentence that tells of it.
 # The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
@@ -21,25 +21,27 @@ _NOISIER = " even if the noise is half as strong again"
 # across a phantom's foot raised the error in fat by 2, 16 and 130 %, in skin by 27, 93 and 380 %.
 _LIMITS = {
     "similarity": (0.7, 0.45, 2, "",
-        "After registration the images agree poorly: local similarity {value} ({limits})."),
-    "unlikeness": (0.05, 0.09, 2, "", "After registration the images are less alike than noise as strong as in the air "
-        f"would leave them: local similarity lacks {{value}} ({{limits}}{_NOISIER}). Is it the same foot, scanned in "
-        "the same way? Parallel imaging and filters change the noise in the tissue."),
-    "offset": (0.07, 0.12, 0, "%", "The images' brightness differs by more than a factor: by an offset of {value} of "
-        f"the tissue's ({{limits}}{_NOISIER}), which is taken for motion. Scan both in the same way, or take it out of "
-        "the images."),
-    "voxel_mm": (2.0, 5.0, 1, " mm", "Slices are {value} apart: strain across them is hardly seen, and strain is found "
-        "where there is none ({limits}). A repeat scan without load tells how much."),
+        "The registered images agree poorly: local similarity {value} ({limits})."),
+    "unlikeness": (0.05, 0.09, 2, "", "The registered images differ by more than noise as strong as in the air "
+        f"explains: local similarity is {{value}} below what it allows ({{limits}}{_NOISIER}). Check that both images "
+        "show the same subject, scanned with the same protocol. Parallel imaging and filters change the noise in the "
+        "tissue."),
+    "offset": (0.07, 0.12, 0, "%", "The images differ by a constant offset in brightness, {value} of the tissue's "
+        f"({{limits}}{_NOISIER}). The registration takes it for motion. Scan both with the same protocol, or remove "
+        "the offset from the images."),
+    "voxel_mm": (2.0, 5.0, 1, " mm", "Slices are {value} apart ({limits}). Strain across slices is hardly resolved, "
+        "and apparent strain appears where there is none. A repeat scan without load measures how much."),
     "bone_shift_mm": (0.3, 0.8, 2, " mm",
-        "The bone, which is rigid, was deformed: {value} root mean square ({limits})."),
+        "The bone, which is rigid, shows an apparent displacement of {value} (root mean square; {limits})."),
     "bone_shear_p95": (0.1, 0.25, 3, "", "The bone, which is rigid, shows an apparent maximum shear strain of {value} "
         "(95th percentile; {limits})."),
-    "lowest_jacobian": (0.3, 0.0, 2, "", "Somewhere tissue is squeezed to {value} of its volume ({limits})."),
-    "undefined_fraction": (0.15, 0.4, 0, "%", "{value} of the tissue has no result: it is not shown by the loaded "
-        "image or not covered by the deformation ({limits})."),
-    "landmark_error_mm": (1.0, 2.0, 2, " mm", "Landmarks are missed by {value} in the median ({limits})."),
-    "floor_shear_p95": (0.06, 0.15, 3, "", "The repeat scan shows an apparent maximum shear strain of {value} (95th "
-        "percentile) where there is none ({limits})."),
+    "lowest_jacobian": (0.3, 0.0, 2, "",
+        "The lowest volume ratio is {value}: tissue is compressed to this fraction of its volume ({limits})."),
+    "undefined_fraction": (0.15, 0.4, 0, "%", "{value} of the tissue has no result: the loaded image does not show it, "
+        "or the deformation does not cover it ({limits})."),
+    "landmark_error_mm": (1.0, 2.0, 2, " mm", "The median landmark error is {value} ({limits})."),
+    "floor_shear_p95": (0.06, 0.15, 3, "", "The repeat scan, without strain, shows an apparent maximum shear strain of "
+        "{value} (95th percentile; {limits})."),
 }  # fmt: skip
 
 
@@ -51,10 +53,10 @@ class Similarity:
     ----------
     found : (before, after rigid, after all)
         Pooled local correlations (`dvc.local_correlation`).
-    possible, offset : (noise as in the air, half as much again)
-        What this noise leaves of the last correlation (`dvc.images.similarity.most_similarity`), and the offset between
-        the registered images as a share of brightness (`dvc.images.similarity.brightness_offset`); NaN where not known.
-        A registration is distrusted where either is beyond its limit for the second as well.
+    possible, offset : (noise as in the air, 1.5 times that noise)
+        The highest correlation that this noise allows (`dvc.images.similarity.most_similarity`), and the offset between
+        the registered images as a fraction of the brightness (`dvc.images.similarity.brightness_offset`); NaN where not
+        known. The verdict is "Do not trust" only where the limit is exceeded at 1.5 times the noise, too.
     """
 
     found: tuple[float, float, float]
@@ -72,32 +74,32 @@ def assess(
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
 ) -> Quality:
-    """Judge a registration by its strain maps, the images' similarity, and more evidence.
+    """Assess a registration by its strain maps, the similarity of the images, and further evidence.
 
     Parameters
     ----------
     maps : StrainMaps
         Displacement (mm) and strain on the unloaded image's grid, reference configuration (`dvc.strain_maps`).
     tissue : Mask
-        Soft tissue and bone, on the same grid: how much of it has no result is counted.
+        Soft tissue and bone, on the same grid; the fraction without a result counts in the verdict.
     bone : Mask or None
-        The bone that was aligned on, on the same grid: motion within it is error. None where there is none.
+        The bone that was aligned on, on the same grid; any motion in it is an error. None without a bone.
     similarity : Similarity, optional
-        None where there are no images to compare; the verdict is then "Use with care" at best.
+        None without images to compare; the verdict is then "Use with care" at best.
     landmark_errors_mm : (n,), optional
         Distance between each registered and each given landmark, mm; NaN where not defined
         (`dvc.target_registration_error`).
     floor : NoiseFloor, optional
         Of a repeat scan without load (`dvc.noise_floor`).
     in_bone : (mm, no unit), optional
-        Where the maps hold the bone at rest: root mean square displacement and 95th percentile of the maximum shear
-        strain in it before that was imposed.
+        For maps with a rigid bone: root mean square displacement and 95th percentile of the maximum shear strain in the
+        bone before it was made rigid.
 
     Returns
     -------
     Quality
-        The figures, and the verdict that follows: "distrust" or "caution" where one is beyond its limit, each with a
-        sentence that names figure and limits, else "trust".
+        The figures, and the verdict: "distrust" or "caution" where a figure exceeds its limit, with one sentence for
+        each such figure that gives its value and limits; otherwise "trust".
     """
     lowest, at = _lowest(maps.jacobian, maps.grid)
     known = int(np.count_nonzero(maps.valid & tissue.inside))
@@ -119,13 +121,13 @@ def assess(
     )
     findings = []
     if bone is not None and not np.isfinite(bone_shift):
-        findings.append(Verdict("caution", ("The bone has no result, so whether it stayed rigid is not known.",)))
+        findings.append(Verdict("caution", ("The bone has no result, so it is not known whether it stayed rigid.",)))
     if similarity is None:
-        findings.append(Verdict("caution", ("No images were compared: the deformation is taken as it was given.",)))
+        findings.append(Verdict("caution", ("No images were compared; the given deformation is not checked.",)))
     if quality.folded_voxels:
         place, least = ", ".join(f"{c:z.1f}" for c in at), _apart(lowest, (0.0,), 2)
-        folds = f"The deformation folds: det F <= 0 in {quality.folded_voxels} voxels, lowest {least} at LPS"
-        findings.append(Verdict("distrust", (f"{folds} ({place}) mm.",)))
+        folds = f"The deformation folds (det F <= 0) in {quality.folded_voxels} voxels; the lowest det F is {least}"
+        findings.append(Verdict("distrust", (f"{folds}, at LPS ({place}) mm.",)))
     if similarity is not None:
         findings += _unlike(similarity, quality, float(maps.grid.spacing_mm.max()))
     for figure in ("bone_shift_mm", "bone_shear_p95", "lowest_jacobian", "undefined_fraction"):
@@ -165,7 +167,7 @@ def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[V
     findings += _judged("offset", quality.offset, similarity.offset[1] > _LIMITS["offset"][1])
     findings += _judged("voxel_mm", slice_mm)
     if after < rigid - 0.01:
-        told = "The non-rigid registration made the images less alike: local similarity went from"
+        told = "The non-rigid registration made the images less similar: local similarity fell from"
         findings.append(Verdict("distrust", (f"{told} {rigid:z.2f} to {after:z.2f}.",)))
     return findings
 
@@ -181,7 +183,7 @@ def _judged(figure: str, value: float, distrusted: bool | None = None) -> list[V
         distrusted = not value >= distrust if falling else value > distrust
     scale, side = 100.0 if unit == "%" else 1.0, "below" if falling else "above"
     near = [limit * scale for limit in (care, distrust)]
-    limits = f"care {side} {near[0]:g}{unit}, distrust {side} {near[1]:g}{unit}"
+    limits = f"use with care {side} {near[0]:g}{unit}, do not trust {side} {near[1]:g}{unit}"
     told = _apart(value * scale, near, decimals) + unit
     return [Verdict("distrust" if distrusted else "caution", (sentence.format(value=told, limits=limits),))]
 

@@ -85,9 +85,9 @@ class ErrorModel:
     source: str
 
     def table_for(self, spacing_mm: FloatArray, snr: float) -> ErrorTable:
-        """The table nearest to a voxel (3,) mm and a signal-to-noise ratio: edges, by size, and ratio within 1.6 times.
+        """The closest table to a voxel (3,) mm and an SNR: sorted edges and SNR each within a factor of 1.6.
 
-        InputError if none is that near; the message names those there are.
+        InputError if no table is that close; the message lists all.
         """
         edges = np.sort(spacing_mm)
 
@@ -99,10 +99,10 @@ class ErrorModel:
         if not far(nearest) <= np.log(_FAR):
             known = "; ".join(f"{_told(t.spacing_mm)} mm at SNR {t.snr:.0f}" for t in self.tables)
             raise InputError(
-                f"The error of {self.preset} is known for voxels of {known}. These images have voxels of "
-                f"{_told(spacing_mm)} mm at SNR {snr:.0f}, too far from any of these: measure it with `mrstrain "
-                f"accuracy --preset {self.preset}` (--spacing, --slice-spacing, --snr) and give its file: error_model "
-                "(--error-model on the command line)."
+                f"The error of {self.preset} is known for voxels of {known}. These images, with voxels of "
+                f"{_told(spacing_mm)} mm at SNR {snr:.0f}, are too far from all of these. Measure the error with "
+                f"`mrstrain accuracy --preset {self.preset}` (--spacing, --slice-spacing, --snr), and pass the file "
+                "that it writes: error_model (--error-model on the command line)."
             )
         return nearest
 
@@ -124,11 +124,11 @@ class ErrorModel:
 
 
 def read_error_model(path: Path | str) -> ErrorModel:
-    """Read what `ErrorModel.write` wrote; InputError if the file cannot be read or is no error model."""
+    """Read a file of `ErrorModel.write`; InputError if it cannot be read or is not an error model."""
     try:
         return _parsed(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError) as failure:
-        what = f"no error model as `mrstrain accuracy` writes it ({type(failure).__name__}: {failure})."
+        what = f"not an error model written by `mrstrain accuracy` ({type(failure).__name__}: {failure})."
         raise InputError(f"{path}: {what}") from failure
 
 
@@ -141,7 +141,7 @@ def error_model_of(preset: str) -> ErrorModel | None:
 def _parsed(text: str) -> ErrorModel:
     told = json.loads(text)
     if told["format"] != _FORMAT:
-        raise ValueError(f"format {told['format']}, not {_FORMAT}")
+        raise ValueError(f"the format is {told['format']}; {_FORMAT} is needed")
 
     def cells(given: Mapping[str, list[object]]) -> dict[str, FloatArray]:
         return {tissue: np.asarray(rows, dtype=np.float64) for tissue, rows in given.items()}
@@ -158,16 +158,16 @@ def _parsed(text: str) -> ErrorModel:
         for t in told["tables"]
     )
     if not tables or any(POOLED not in cells for t in tables for cells in (t.whole, *t.runs)):
-        raise ValueError(f"no table, or one without a row '{POOLED}'")
+        raise ValueError(f"it has no table, or a table without a row '{POOLED}'")
     for t in tables:
         shape = (2, len(t.to_bone_mm), len(t.shear))
         figures = (rows for cells in (t.whole, *t.runs) for rows in cells.values())
         sound = (rows.shape == shape and np.isfinite(rows).all() and (rows[1] >= 0).all() for rows in figures)
         if not (t.runs and all(sound)):
-            raise ValueError(f"a table without runs, or whose figures are not {shape} finite numbers")
+            raise ValueError(f"a table has no runs, or its figures are not {shape} finite numbers")
         rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
         if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
-            raise ValueError("a voxel, noise or bin that is not positive and rising")
+            raise ValueError("a voxel size, SNR or bin is not positive, or the bins do not increase")
     return ErrorModel(str(told["preset"]), str(told["parameters_sha256"]), tables, str(told["source"]))
 
 

@@ -33,10 +33,11 @@ def read_landmarks(
     ----------
     path : path, or a pair of paths
         A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and optionally
-        name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first. These are paired by name where both
-        hold the same names, each once, and in order (logged) where they share none; anything between is refused.
+        name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first. If both lists have the same names,
+        each once, points are paired by name; if they have no name in common, in the order listed (logged); otherwise
+        they are refused.
     frame : {"LPS", "RAS"}
-        Frame of the CSV's coordinates. Slicer's files tell theirs.
+        Frame of the coordinates in the CSV file. Slicer files state their own.
 
     Returns
     -------
@@ -53,29 +54,29 @@ def read_landmarks(
         If a file is missing or damaged, a column or number is missing, or its frame or unit is not known.
     """
     if frame not in _TO_LPS:
-        raise InputError(f"The frame of landmarks is LPS or RAS; got {frame!r}.")
+        raise InputError(f"The frame of landmarks must be LPS or RAS; got {frame!r}.")
     if isinstance(path, tuple):
         return _paired(Path(path[0]), Path(path[1]))
     file = Path(path)
     if file.suffix.lower() != ".csv":
         raise InputError(
-            f"{file}: landmark pairs are one CSV file, or two point lists of Slicer (.mrk.json, .fcsv) given "
-            "together, the unloaded image's first."
+            f"{file}: landmark pairs are read from one CSV file, or from two point lists of Slicer (.mrk.json, "
+            ".fcsv): first that of the unloaded image, then that of the loaded one."
         )
     pairs, names = [], []
     rows = csv.DictReader(_text(file).splitlines())
     header = [str(name).strip().casefold() for name in rows.fieldnames or []]
     if missing := [name for name in _COLUMNS if name not in header]:
         raise ImageFileError(
-            f"{file}: the column {missing[0]} is missing; a file of landmark pairs needs the columns "
-            f"{', '.join(_COLUMNS)} in its first line. Found: {', '.join(header) or 'nothing'}."
+            f"{file}: the column {missing[0]} is missing. The first line must name the columns "
+            f"{', '.join(_COLUMNS)}; it has: {', '.join(header) or 'nothing'}."
         )
     rows.fieldnames = header
     for count, row in enumerate(rows, start=1):
         pairs.append([_number(f"{file}, line {rows.line_num}", name, row[name]) for name in _COLUMNS])
         names.append((row.get("name") or str(count)).strip())
     if not pairs:
-        raise ImageFileError(f"{file} has no landmark below its header.")
+        raise ImageFileError(f"{file}: no landmarks below the header line.")
     reference, deformed = np.split(np.array(pairs), 2, axis=1)
     return reference * _TO_LPS[frame], deformed * _TO_LPS[frame], tuple(names)
 
@@ -83,21 +84,21 @@ def read_landmarks(
 def target_registration_error(
     deformation: Deformation, reference_mm: FloatArray, deformed_mm: FloatArray
 ) -> FloatArray:
-    """Distance between where a deformation puts each landmark and where it was seen, |X + u(X) - x|.
+    """Distance between the registered and the observed position of each landmark, |X + u(X) - x|.
 
     Parameters
     ----------
     deformation : Deformation
-        The whole motion from the unloaded to the loaded image, the bone's included, since the landmarks x lie in the
-        loaded image as it was scanned.
+        The whole motion from the unloaded to the loaded image, bone motion included, because the landmarks x are in
+        the loaded image as scanned.
     reference_mm, deformed_mm : (n, 3)
         Landmarks X in the unloaded and x in the loaded image, LPS mm.
 
     Returns
     -------
     (n,)
-        mm; NaN where the deformation is not defined. Count these in any summary: a mean over the others alone looks
-        better than the registration is.
+        mm; NaN where the deformation is not defined. Report their number, because a mean over the other landmarks alone
+        is too optimistic.
 
     Raises
     ------
@@ -113,7 +114,7 @@ def target_registration_error(
     """
     X, x = np.asarray(reference_mm, dtype=np.float64), np.asarray(deformed_mm, dtype=np.float64)
     if X.shape != x.shape or X.ndim != 2 or X.shape[1] != 3:
-        raise InputError(f"Landmarks must be two arrays (n, 3) of one length; got {X.shape} and {x.shape}.")
+        raise InputError(f"Landmarks must be two arrays (n, 3) of equal length; got {X.shape} and {x.shape}.")
     return np.asarray(np.linalg.norm(X + deformation.displacement(X) - x, axis=1))
 
 
@@ -125,22 +126,22 @@ def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[st
     elif len(names) != len(others) or set(names) & set(others):
         only = sorted(set(names) ^ set(others))
         repeated = sorted({name for some in (names, others) for name in some if some.count(name) > 1})
-        odd = f"in one file only: {', '.join(only) or 'none'}; repeated: {', '.join(repeated) or 'none'}"
+        odd = f"only in one file: {', '.join(only) or 'none'}; repeated: {', '.join(repeated) or 'none'}"
         raise InputError(
-            f"{first} holds {len(names)} points and {second} {len(others)}, and their names do not match one "
-            f"to one ({odd}). Give both lists the same names, each once."
+            f"The point names in {first} ({len(names)} points) and {second} ({len(others)} points) do not match one "
+            f"to one ({odd}). Use the same names in both lists, each once."
         )
     else:
-        _log.warning("%s and %s share no name; their points are paired in order.", first, second)
+        _log.warning("%s and %s have no point name in common; points are paired in the order listed.", first, second)
     return np.stack([X for _, X in reference]), np.stack([x for _, x in deformed]), tuple(names)
 
 
 def _slicer_points(path: Path) -> _Points:
     read = {".json": _from_markups, ".fcsv": _from_fcsv}.get(path.suffix.lower())
     if read is None:
-        raise InputError(f"{path}: a point list of Slicer ends in .mrk.json or .fcsv.")
+        raise InputError(f"{path}: not a Slicer point list; its name must end in .mrk.json or .fcsv.")
     if not (points := read(path)):
-        raise ImageFileError(f"{path} holds no point.")
+        raise ImageFileError(f"{path}: the list has no points.")
     return points
 
 
@@ -150,10 +151,10 @@ def _from_markups(path: Path) -> _Points:
         frame, unit = str(markup["coordinateSystem"]), markup.get("coordinateUnits", "mm")
         listed: list[dict[str, Any]] = list(markup["controlPoints"])
     except (ValueError, KeyError, TypeError) as error:
-        what = f"is not a point list of Slicer with one list of points ({type(error).__name__}: {error})"
+        what = f"is not a Slicer file with one point list ({type(error).__name__}: {error})"
         raise ImageFileError(f"{path} {what}.") from error
     if frame not in _TO_LPS or unit not in ("mm", ["mm", "UCUM"]):
-        raise ImageFileError(f"{path}: coordinates must be LPS or RAS, in mm; the file says {frame}, {unit}.")
+        raise ImageFileError(f"{path}: coordinates must be in mm, LPS or RAS; the file gives {frame}, {unit}.")
     points: _Points = []
     for count, point in enumerate(listed, start=1):
         name, position = str(point.get("label") or count), point.get("position")
@@ -175,7 +176,7 @@ def _from_fcsv(path: Path) -> _Points:
     points: _Points = []
     for line, text in (each for each in lines if not each[1].startswith("#")):
         if frame is None or not {"x", "y", "z"} <= set(columns):
-            what = "its header does not tell the frame (CoordinateSystem = LPS or RAS) and the columns"
+            what = "the header lacks the frame (CoordinateSystem = LPS or RAS) or the columns"
             raise ImageFileError(f"{path}: {what}. Save the list again in Slicer.")
         row = dict(zip(columns, next(csv.reader([text])), strict=False))
         position = np.array([_number(f"{path}, line {line}", axis, row.get(axis)) for axis in "xyz"])
@@ -197,4 +198,4 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ImageFileError(f"{path} cannot be read as text: {error}.") from error
+        raise ImageFileError(f"{path}: cannot be read as text ({error}).") from error

@@ -74,26 +74,26 @@ class Quality:
         Pooled local correlation of the two images in the tissue (`dvc.local_correlation`), -1 to 1, as scanned, after
         the rigid part and after all; None where no images were compared.
     most_similarity : float
-        What noise as in the air lets the last of these be, 0 to 1; NaN where that is not known.
+        Highest value of the last of these that noise as in the air allows, 0 to 1; NaN if not known.
     offset : float
-        Offset between the images as a share of the tissue's brightness, no unit; NaN where that is not known.
+        Offset between the images as a fraction of the tissue's brightness, no unit; NaN if not known.
     folded_voxels : int
         Number of voxels with det F <= 0.
     lowest_jacobian, lowest_jacobian_at_mm : float, (x, y, z)
         Lowest det F, no unit, and the centre of its voxel, LPS mm, reference configuration; NaN without any value.
     undefined_fraction : float
-        Share of the tissue's voxels without a value, 0 to 1.
+        Fraction of the tissue's voxels without a value, 0 to 1.
     bone_shift_mm, bone_shear_p95 : float
         Root mean square displacement, mm, and 95th percentile of the apparent maximum shear strain (E1 - E3)/2, no
-        unit, left inside the bone, which is rigid: zero is the truth. NaN without a bone.
+        unit, in the bone, which is rigid: the true values are zero. NaN without a bone.
     bone_held : bool
-        Whether these two are from before the bone was held at rest, as it is in the maps.
+        Whether these two are from the preceding smooth spline, because the bone is rigid in the maps.
     landmark_errors_mm : (n,) or None
         Distance between each registered and each given landmark, mm; NaN where not defined. None without landmarks.
     noise_floor : NoiseFloor or None
         Apparent strain of a repeat scan; None without one.
     verdict : Verdict
-        What follows: whether the registration may be trusted, with reasons.
+        The verdict on the registration, with reasons.
     """
 
     similarity: tuple[float, float, float] | None
@@ -179,4 +179,4 @@ def read_noise_floor(path: Path) -> NoiseFloor | None:
         told = json.loads(path.read_text(encoding="utf-8"))["noise_floor"]
         return None if told is None else NoiseFloor.from_dict(told)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: no quality of a repeat scan ({error!r}). Register the repeat scan again.") from error
+        raise InputError(f"{path}: not the quality of a repeat scan ({error!r}). Register that scan again.") from error

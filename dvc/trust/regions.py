@@ -55,7 +55,7 @@ def volume_above(values: npt.ArrayLike, volumes_ml: npt.ArrayLike, thresholds: n
     """
     flat, volumes = np.asarray(values, dtype=np.float64).ravel(), np.asarray(volumes_ml, dtype=np.float64)
     if volumes.ndim and volumes.shape != flat.shape:
-        raise InputError(f"Got {flat.size} values and volumes of shape {volumes.shape}; give one volume for each.")
+        raise InputError(f"Each value needs one volume; got {flat.size} values and volumes of shape {volumes.shape}.")
     known = ~np.isnan(flat)
     each = np.broadcast_to(volumes, flat.shape)[known]
     order = np.argsort(flat[known])
@@ -73,10 +73,10 @@ def region_statistics(labels: LabelMap, values: Mapping[str, npt.NDArray[np.floa
     for quantity, array in values.items():
         if array.shape != labels.grid.shape:
             raise GeometryError(
-                f"'{quantity}' has shape {array.shape}, the label map {labels.grid.shape}; they must be on one grid."
+                f"'{quantity}' has shape {array.shape}, but the label map {labels.grid.shape}. Use the same grid."
             )
         if infinite := int(np.count_nonzero(np.isinf(array))):
-            raise InputError(f"'{quantity}' holds {infinite} infinite values; set them to NaN (missing).")
+            raise InputError(f"'{quantity}' has {infinite} infinite values; set them to NaN (missing).")
     flat, voxel_ml = labels.labels.ravel(), labels.grid.voxel_volume_mm3 / 1000.0
     voxels_of = {name: np.flatnonzero(flat == label) for label, name in labels.names.items()}
     return [
@@ -121,7 +121,7 @@ def read_regions_csv(path: Path) -> list[RegionRow]:
         with path.open(newline="", encoding="utf-8") as file:
             return [_row_of(cells) for cells in csv.DictReader(file)]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as failure:
-        what = f"no statistics by region ({failure!r}). Register this load again, or get a whole copy of the file"
+        what = f"cannot be read as statistics by region ({failure!r}). Register this load again, or copy the file again"
         raise InputError(f"{path}: {what}.") from failure
 
 

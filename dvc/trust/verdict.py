@@ -15,14 +15,14 @@ _WORDS: dict[Level, str] = {"trust": "Trust", "caution": "Use with care", "distr
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a result may be used, and why (not).
+    """Verdict on a result, with reasons.
 
     Parameters
     ----------
     level : {"trust", "caution", "distrust"}
         From the best to the worst; in words "Trust", "Use with care", "Do not trust".
     reasons : tuple of str
-        Full sentences, each naming a figure and its limits; at least one below "trust".
+        Full sentences, each with a figure and its limits; at least one reason unless the level is "trust".
 
     Raises
     ------
@@ -40,9 +40,9 @@ class Verdict:
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
-            raise InputError(f"A verdict is one of {list(LEVELS)}; got '{self.level}'.")
+            raise InputError(f"The level of a verdict must be one of {list(LEVELS)}; got '{self.level}'.")
         if self.level != "trust" and not self.reasons:
-            raise InputError(f"The verdict '{self.level}' needs a reason; give at least one sentence.")
+            raise InputError(f"The verdict '{self.level}' needs at least one reason.")
 
     @property
     def words(self) -> str:
@@ -63,7 +63,7 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
     Verdict(level='distrust', reasons=('It folds.',))
     """
     if not (given := list(verdicts)):
-        raise InputError("There is no verdict to choose the worst of; judge at least one result first.")
+        raise InputError("No verdicts were given; assess at least one result first.")
     level = together(given).level
     return Verdict(level, tuple(dict.fromkeys(r for v in given if v.level == level for r in v.reasons)))
 

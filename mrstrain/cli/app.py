@@ -12,13 +12,13 @@ from typing import Annotated
 import typer
 
 from mrstrain.cli import measurement, models, studies
-from mrstrain.cli.options import Grouped
+from mrstrain.cli.options import EXAMPLES, Grouped
 
 _M_ARENA_MAX = -8  # of glibc's malloc.h
 
 app = typer.Typer(
     name="mrstrain",
-    help="Strain inside soft tissue from pairs of MR images, and how far it may be trusted.",
+    help="Measure strain inside soft tissue from pairs of MR images, and compare finite-element models with it.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -48,12 +48,12 @@ for _command in (
     measurement.phantom, measurement.twin, measurement.accuracy, models.mesh, models.simulate, models.compare,
     models.drive, models.level, models.converge, models.fit,
 ):  # fmt: skip
-    app.command(cls=Grouped)(_command)
+    app.command(cls=Grouped, epilog=EXAMPLES.get(_command.__name__))(_command)
 
 
 @app.command()
 def doctor() -> None:
-    """Is this machine fit to run mrstrain?"""
+    """Check whether this machine can run mrstrain."""
     from mrstrain.records.doctor import examine
 
     def trial(what: str, module: str) -> str:

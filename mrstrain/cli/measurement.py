@@ -10,7 +10,9 @@ from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_opti
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.options.modelling import HeelShape
 
-SliceSpacing = Annotated[float | None, typer.Option(help="Their edge along the third axis, where it is another, mm.")]
+SliceSpacing = Annotated[
+    float | None, typer.Option(help="Voxel edge along the third axis, mm. Default: the same as --spacing.")
+]
 
 
 @takes_options
@@ -19,7 +21,7 @@ def register(
     loads: Annotated[list[Path], typer.Argument(help="Loaded images.")], out: Out, subject_files: SubjectFiles,
     registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
 ) -> None:  # fmt: skip
-    """Displacement and strain of loaded images against the unloaded one, with quality and a report."""
+    """Measure displacement and strain between an unloaded image and loaded ones, with a verdict and a report."""
     carry_out(
         mrstrain.register.with_options, load0, loads, out=out, subject_files=subject_files, registration=registration,
         scans=scans, onto=onto, running=running,
@@ -28,28 +30,28 @@ def register(
 
 @takes_options
 def strain(
-    reference: Annotated[Path, typer.Argument(help="Unloaded image: gives the grid.")],
+    reference: Annotated[Path, typer.Argument(help="Unloaded image; strain is computed on its voxels.")],
     deformation: Annotated[
         Path, typer.Argument(help="elastix transform .txt, ITK transform (.h5, .tfm), or a displacement image.")
     ],
     out: Out, subject_files: SubjectFiles, onto: MeshAndAxes, frame: FieldFrame = None,
 ) -> None:  # fmt: skip
-    """Strain maps from a transform or displacement field that any tool has made."""
+    """Compute strain maps from a transform or displacement field of any tool."""
     given = mrstrain.strain.with_options
     tell(given(reference, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto))
 
 
 @takes_options
 def phantom(
-    out: Out, seed: Annotated[int, typer.Option(min=0, help="Of shapes, textures, noise and the foot's motions.")] = 1,
+    out: Out, seed: Annotated[int, typer.Option(min=0, help="Seed of shapes, textures, noise and rigid motions.")] = 1,
     load: Annotated[
-        list[str] | None, typer.Option(help="Load1, Load2, Load3 or Load4; repeat for several. Default: all.")
+        list[str] | None, typer.Option(help="Load1, Load2, Load3 or Load4. Default: all. Repeat for several.")
     ] = None,
-    spacing: Annotated[float, typer.Option(help="Edge of the voxels, mm.")] = 0.8, slice_spacing: SliceSpacing = None,
-    snr: Annotated[float, typer.Option(help="Fat's signal over the noise's standard deviation.")] = 25.0,
+    spacing: Annotated[float, typer.Option(help="Voxel edge, mm.")] = 0.8, slice_spacing: SliceSpacing = None,
+    snr: Annotated[float, typer.Option(help="Signal of fat over the standard deviation of the noise.")] = 25.0,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False, *, shape: HeelShape,
 ) -> None:  # fmt: skip
-    """Images of a synthetic heel under Load0 to Load4, with their exactly known strain."""
+    """Make images of a synthetic heel under Load0 to Load4, with exactly known strain."""
     from phantoms import LOADS
 
     edges = (spacing, spacing, spacing if slice_spacing is None else slice_spacing)
@@ -61,15 +63,15 @@ def phantom(
 
 @takes_options
 def twin(
-    load0: Annotated[Path, typer.Argument(help="Unloaded image of your own.")],
+    load0: Annotated[Path, typer.Argument(help="Your own unloaded image.")],
     deformation: Annotated[
         Path,
         typer.Argument(help="The whole motion: elastix .txt, ITK transform (.h5, .tfm), or a displacement image."),
     ],
     out: Out, subject_files: SubjectFiles, frame: FieldFrame = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise and bias field.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise and bias field.")] = 1,
 ) -> None:  # fmt: skip
-    """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""
+    """Make a synthetic warp of your own unloaded image, with its exact strain, to test a registration."""
     tell(mrstrain.twin.with_options(load0, deformation, out=out, subject_files=subject_files, frame=frame, seed=seed))
 
 
@@ -77,25 +79,32 @@ def accuracy(
     out: Out,
     preset: Annotated[
         list[str] | None,
-        typer.Option(help="gauss-newton, gauss-newton-borders (labels), elastix' preset or file (.txt); repeatable."),
+        typer.Option(
+            help="gauss-newton, gauss-newton-borders (with labels), an elastix preset, or an elastix parameter file "
+            "(.txt). Default: gauss-newton. Repeat for several."
+        ),
     ] = None,
-    spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
+    spacing: Annotated[list[float] | None, typer.Option(help="Voxel edge, mm. Repeat for several.")] = None,
     slice_spacing: SliceSpacing = None,
-    snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio; repeat for several.")] = None,
+    snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio. Repeat for several.")] = None,
     motion: Annotated[
         list[str] | None,
-        typer.Option(help="still, smooth, sliding, swelling, Load1 to Load4, wave-L (L mm); repeat for several."),
+        typer.Option(help="still, smooth, sliding, swelling, Load1 to Load4, or wave-L (L in mm). Repeat for several."),
     ] = None,
     seed: Annotated[
         list[int] | None,
-        typer.Option(min=0, help="Heel; repeat for several. Default: 1 and 2. 9000 to 9999 are for published figures."),
+        typer.Option(
+            min=0,
+            help="Seed of the heel. Default: 1 and 2; 9000 to 9999 are for published figures. Repeat for several.",
+        ),
     ] = None,
     workers: Workers = None,
 ) -> None:
-    """Error of a preset or engine on phantoms: by tissue, place, strain, noise, resolution. Goes on where it stopped.
+    """Measure the error of an engine or preset on phantoms: by tissue, position and strain; noise floor; resolution.
 
-    Without options 110 registrations: gauss-newton, seven motions and eight waves, voxels of 0.8 mm at SNR 25, 12 and
-    50, of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr these alone (default 0.8 mm, 25).
+    An interrupted study resumes. Default: 110 registrations with gauss-newton, seven motions and eight waves; voxels
+    of 0.8 mm at SNR 25, 12 and 50, and of 1.2 mm and 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr, only the
+    conditions given are measured; the other of the two is then 0.8 mm or 25.
     """
     from dvc.registration.engines import DEFAULT
     from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES

@@ -12,12 +12,12 @@ from mrstrain.options import modelling
 from mrstrain.options.measurement import Cores, EngineOptions, Seeded, SubjectFiles
 
 LabelMap = Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")]
-Measured = Annotated[Path, typer.Argument(help="Results of register: a folder for each load, or one of these.")]
+Measured = Annotated[Path, typer.Argument(help="Results folder of register, or the folder of one of its loads.")]
 Loads = Annotated[
     list[str] | None,
     typer.Option(
-        help="NAME=NORMAL or NAME=NORMAL,SHEAR in N, or with mm after a number plate displacement; repeat. "
-        "Default: the published experiment's four.",
+        help="NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N, or plate displacements with mm after the number. "
+        "Default: the four loads of the published experiment. Repeat for several.",
         rich_help_panel="Model",
     ),
 ]
@@ -28,12 +28,15 @@ def mesh(
     labels: LabelMap,
     out: Annotated[
         Path,
-        typer.Option(help="The mesh, ending in .vtu; with a .json and a .png beside it.", rich_help_panel="Output"),
+        typer.Option(
+            help="File name of the mesh, ending in .vtu; a .json and a .png of the same name are also written.",
+            rich_help_panel="Output",
+        ),
     ],
     labelling: modelling.Labelling,
     meshing: modelling.Meshing,
 ) -> None:
-    """Soft tissues of a label map as tetrahedra, with named tissues and surfaces (bone, skin, cut)."""
+    """Mesh the soft tissues of a label map with tetrahedra, with named tissues and surface sets (bone, skin, cut)."""
     from mrstrain.records.progress import live
 
     with live() as progress:
@@ -44,11 +47,11 @@ def mesh(
 
 @takes_options
 def simulate(
-    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra with facets 'bone' and 'skin'.")], out: Out,
+    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra with surface sets 'bone' and 'skin'.")], out: Out,
     simulation: modelling.SimulationOptions, plate_options: modelling.PlateOptions,
     coordinates: modelling.MeshCoordinates, cores: Cores, load: Loads = None,
 ) -> None:  # fmt: skip
-    """A rigid plate presses and shears soft tissue on fixed bone: displacement, strain and stress for each load."""
+    """Simulate a rigid plate that presses and shears soft tissue on fixed bone; gives displacement, strain, stress."""
     from mrstrain.models.simulate import loads_named
 
     carry_out(
@@ -62,16 +65,19 @@ def compare(
     dvc: Measured,
     models: Annotated[
         list[Path],
-        typer.Argument(help="For each model a folder with a file for each load (Load1.vtu, .frd, .csv ...)."),
+        typer.Argument(help="One folder per model, with one file per load (Load1.vtu, .frd, .csv ...)."),
     ],
     out: Out, labelling: modelling.LabelMapFile, reading: modelling.ModelReading, directions: modelling.Directions,
     comparison: modelling.ComparisonOn,
     to_image: Annotated[
         Path | None,
-        typer.Option(help="Text file: 4 x 4 map of the models' frame to the image's, LPS mm.", rich_help_panel="Model"),
+        typer.Option(
+            help="Text file with the 4 x 4 matrix from the frame of the models to that of the image, LPS mm.",
+            rich_help_panel="Model",
+        ),
     ] = None,
 ) -> None:  # fmt: skip
-    """Finite-element models of any code against a measurement: curves, areas, location, agreement, and a report."""
+    """Compare FE models of any code with a measurement: strain-volume curves, areas, location, agreement; a report."""
     from mrstrain.records.inputs import read_matrix
 
     matrix = None if to_image is None else read_matrix(to_image)
@@ -83,24 +89,26 @@ def compare(
 
 @takes_options
 def drive(
-    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra; facets 'bone' do not move.")], dvc: Measured,
+    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra; its surface set 'bone' is fixed.")], dvc: Measured,
     out: Out, material: modelling.MaterialSets, coordinates: modelling.MeshCoordinates,
 ) -> None:  # fmt: skip
-    """A model whose outside goes where the measurement puts it: laws are judged apart from the plate."""
+    """Simulate with measured boundary conditions, so that material sets are compared without the plate."""
     carry_out(mrstrain.drive.with_options, mesh, dvc, out=out, material=material, coordinates=coordinates)
 
 
 @takes_options
 def level(
     load0: Annotated[Path, typer.Argument(help="The unloaded image.")],
-    model: Annotated[Path, typer.Argument(help="Folder of a model, with a file for each load, as in compare.")],
+    model: Annotated[Path, typer.Argument(help="Folder of a model with one file per load, as in compare.")],
     out: Out, subject_files: SubjectFiles, engine: EngineOptions, reading: modelling.ModelReading, seeded: Seeded,
     load: Annotated[
         list[str] | None,
-        typer.Option(help="Name of a load; repeat. Default: all of the model's.", rich_help_panel="Model"),
+        typer.Option(
+            help="Name of a load. Default: all loads of the model. Repeat for several.", rich_help_panel="Model"
+        ),
     ] = None,
 ) -> None:  # fmt: skip
-    """A model sent through the measurement itself (it moves the image, which is registered): like against like."""
+    """Forward-model comparison: warp the image by a model's displacement, and register it like the real pair."""
     carry_out(
         mrstrain.level.with_options, load0, model, out=out, subject_files=subject_files, loads=load or (),
         engine=engine, reading=reading, seeded=seeded,
@@ -110,11 +118,13 @@ def level(
 @takes_options
 def converge(
     labels: LabelMap, out: Out,
-    edge_mm: Annotated[list[float], typer.Option(help="Length of edges, mm; three or more.", rich_help_panel="Model")],
+    edge_mm: Annotated[
+        list[float], typer.Option(help="Edge length, mm. Repeat for three or more.", rich_help_panel="Model")
+    ],
     labelling: modelling.Labelling, directions: modelling.Directions, followed: modelling.Followed, load: Loads = None,
     workers: Workers = None,
 ) -> None:  # fmt: skip
-    """The same loads on meshes of several sizes: percentiles of strain and plate travel, and what they tend to."""
+    """Mesh convergence: the same loads on several edge lengths, and the limits of strain and plate displacement."""
     from mrstrain.models.simulate import loads_named
 
     carry_out(
@@ -127,16 +137,20 @@ def fit(
     curve: Annotated[
         Path,
         typer.Argument(
-            help="CSV with columns stretch and nominal_stress_kpa (or _mpa, or true_stress_...), perhaps test."
+            help="CSV with the columns stretch and nominal_stress_kpa (or _mpa, or true_stress_...); optional: test."
         ),
     ],
     out: Out,
-    law: Annotated[str, typer.Option(help="neo-Hooke, Isihara, Yeoh, Ogden, Ogden-2, Ogden-3 or Hencky.")],
+    law: Annotated[
+        str,
+        typer.Option(help="Constitutive model: neo-Hooke, Isihara, Yeoh, Ogden, Ogden-2, Ogden-3 or Hencky."),
+    ],
     test: Annotated[
-        str | None, typer.Option(help="uniaxial, equibiaxial or 'pure shear', where the file has no column for it.")
+        str | None,
+        typer.Option(help="Kind of test: uniaxial, equibiaxial or 'pure shear'. Default: the column test of the file."),
     ] = None,
-    nu: Annotated[float, typer.Option(help="Poisson's ratio to simulate with.")] = 0.4999,
-    tissue: Annotated[str, typer.Option(help="Region that the law is for, in the set that is written.")] = "fat",
+    nu: Annotated[float, typer.Option(help="Poisson's ratio for simulations.")] = 0.4999,
+    tissue: Annotated[str, typer.Option(help="Region of the material in the material set that is written.")] = "fat",
 ) -> None:
-    """Parameters of a material law from a stretch-stress curve, with 95 % intervals and the range of stability."""
+    """Fit a constitutive model to a stretch-stress curve, with 95 % intervals and the range of stability."""
     tell(mrstrain.fit(curve, law, out=out, test=test, nu=nu, tissue=tissue))

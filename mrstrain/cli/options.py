@@ -17,17 +17,28 @@ from mrstrain.options.measurement import Frame
 from mrstrain.options.model import Options, bare
 
 P = ParamSpec("P")
-Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.", rich_help_panel="Output")]
+Out = Annotated[Path, typer.Option(help="Folder for the results; created if missing.", rich_help_panel="Output")]
 FieldFrame = Annotated[
     Frame | None,
     typer.Option(
-        help="Frame of a displacement image's components, where no JSON beside it tells.", rich_help_panel="Inputs"
+        help="Frame of the components of a displacement image, if no JSON file next to it gives the frame.",
+        rich_help_panel="Inputs",
     ),
 ]
 Workers = Annotated[
     int | None,
-    typer.Option(min=1, help="Jobs at once. Default: one for each core.", rich_help_panel="Advanced"),
+    typer.Option(min=1, help="Jobs at the same time. Default: one per core.", rich_help_panel="Advanced"),
 ]
+
+EXAMPLES = {
+    command: f"\b\nExample:\n  mrstrain {command} {given}"
+    for command, given in {
+        "register": "Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --out results",
+        "simulate": "heel.vtu --set trebbi --load Load1=115 --out simulated",
+        "compare": "results simulated/trebbi --labels tissues.nii.gz --names tissues.csv --out compared",
+    }.items()
+}
+"""The end of a command's help, by command."""
 
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
 

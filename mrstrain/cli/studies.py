@@ -11,7 +11,7 @@ from mrstrain.cli.options import Done, Out, P, Workers, tell
 
 StudyFile = Annotated[Path, typer.Argument(help="The study file, or its folder.")]
 Scheduler = Annotated[
-    str | None, typer.Option(help="Address of a Dask scheduler to use, such as tcp://node1:8786; see docs/cluster.md.")
+    str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://node1:8786; see docs/cluster.md.")
 ]
 
 
@@ -25,15 +25,19 @@ def _carry_out(work: Callable[P, Done], *given: P.args, **options: P.kwargs) -> 
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(help="With images, label map, and perhaps results of other codes.")],
-    name: Annotated[str, typer.Option(help="In the report; nothing that names a patient.")] = "Subject 01",
+    folder: Annotated[
+        Path, typer.Argument(help="Folder with the images, the label map and, optionally, results of other codes.")
+    ],
+    name: Annotated[
+        str, typer.Option(help="Name of the subject in the report; must not identify a patient.")
+    ] = "Subject 01",
 ) -> None:
-    """Write a study file, with comments, from what a folder holds."""
+    """Write a commented study file for the contents of a folder."""
     tell(mrstrain.init(folder, name=name))
 
 
 def check(study: StudyFile, workers: Workers = None) -> None:
-    """Look at every input of a study: all that is wrong at once, and the time, memory and disk that a run takes."""
+    """Check all inputs of a study at once, and estimate the time, memory and disk space of a run."""
     done = mrstrain.check(study, workers=workers)
     tell(done)
     if done.wrong:
@@ -43,15 +47,18 @@ def check(study: StudyFile, workers: Workers = None) -> None:
 def run(
     study: StudyFile,
     only: Annotated[
-        list[str] | None, typer.Option(help="Kind or name of stages to run (register, 'simulate trebbi'); repeat.")
+        list[str] | None,
+        typer.Option(help="Run only these stages, by kind or name (register, 'simulate trebbi'). Repeat for several."),
     ] = None,
-    force: Annotated[list[str] | None, typer.Option(help="Kind or name of stages to make anew; repeat.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would be done.")] = False,
-    report_only: Annotated[bool, typer.Option("--report-only", help="Only write the report anew.")] = False,
+    force: Annotated[
+        list[str] | None, typer.Option(help="Stages to run again, by kind or name. Repeat for several.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be done.")] = False,
+    report_only: Annotated[bool, typer.Option("--report-only", help="Only write the report again.")] = False,
     scheduler: Scheduler = None,
     workers: Workers = None,
 ) -> None:
-    """A study from its file to its report: register, mesh, simulate, compare. Goes on where it stopped."""
+    """Run a study from its file to its report: register, mesh, simulate, compare. An interrupted run resumes."""
     from mrstrain.studies.run import forecast, report
 
     given = {"--only": only, "--force": force, "--scheduler": scheduler, "--workers": workers}
@@ -72,14 +79,14 @@ def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
     if idle:
         from dvc.errors import ParameterError
 
-        raise ParameterError(f"{why}: leave out {', '.join(idle)}, or it.")
+        raise ParameterError(f"{why}, so {', '.join(idle)} would have no effect. Leave out one of them.")
 
 
 def cohort(
     studies: Annotated[list[Path], typer.Argument(help="Study files, or their folders.")], out: Out,
     scheduler: Scheduler = None, workers: Workers = None,
 ) -> None:  # fmt: skip
-    """The studies of many subjects on one cluster: one table, one report, and the models ranked over all."""
+    """Run the studies of several subjects on one cluster: one table, one report, models ranked over all subjects."""
     _carry_out(mrstrain.cohort, studies, out=out, scheduler=scheduler, workers=workers)
 
 
@@ -89,12 +96,14 @@ def demo(
     full: Annotated[
         bool,
         typer.Option(
-            "--full", help="The published size, an hour: seven sets, 75,000 cells; friedman is cut, which it tells."
+            "--full",
+            help="Published size, about an hour: seven material sets, 75,000 cells. friedman stops early; the report "
+            "says so.",
         ),
     ] = False,
     workers: Workers = None,
 ) -> None:
-    """A heel phantom with known strain under four loads, taken through a whole study: error by tissue, and a report."""
+    """Run a whole study on a heel phantom with known strain under four loads: error by tissue, and a report."""
     from mrstrain.studies.demo import demo as run
 
     _carry_out(run, out, seed=seed, full=full, workers=workers)

@@ -29,21 +29,21 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
     bending, volume, borders = how.bending, how.volume, how.borders
     if name != ELASTIX and (parameters or preset):
         raise ParameterError(
-            f"Presets and parameter files are elastix'; the engine {name} takes weights: bending and volume. "
-            "Leave the engine out, or name elastix."
+            f"Presets and parameter files are for elastix, but the engine is {name} (its weights are bending and "
+            "volume). Leave the engine out, or set it to elastix."
         )
     if name == GAUSS_NEWTON:
         if borders and not labelled:
-            raise InputError("Borders need the tissues: give a label map of the unloaded image (labels).")
+            raise InputError("borders needs a label map of the tissues on the unloaded image (labels).")
         smooth = GaussNewton(bending=bending, volume=volume)
         return GaussNewtonWithInterfaces(smooth) if labelled and borders is not False else smooth
     if bending is not None or volume is not None:
-        raise ParameterError(f"bending and volume are weights of the engine {GAUSS_NEWTON}; {name} has none.")
+        raise ParameterError(f"bending and volume are only for the engine {GAUSS_NEWTON}; the engine is {name}.")
     if borders:
-        raise ParameterError(f"borders are for the engine {GAUSS_NEWTON}: {name} finds one smooth spline.")
+        raise ParameterError(f"borders is only for the engine {GAUSS_NEWTON}; {name} fits one smooth spline.")
     if name != ELASTIX:
         return ENGINES[name]()
     if parameters and preset:
-        raise ParameterError(f"Give the preset {preset} or parameter files, not both: only one of them would be used.")
+        raise ParameterError(f"Both the preset {preset} and parameter files were given; use only one of them.")
     files = tuple(read_parameter_file(p, allow_unknown=how.allow_unknown_parameters) for p in parameters)
     return Elastix(files or (load_preset(preset or "heel-mr"),))

@@ -96,7 +96,7 @@ def _twin_check(
     maps = maps_of(again)
     folded = float(np.mean(maps.jacobian[tissue.inside] <= 0.0))
     if folded > _FOLDED:
-        return TwinCheck(None, f"Its registration folds in {folded:.1%} of the tissue, so it tells nothing.")
+        return TwinCheck(None, f"Its registration folds in {folded:.1%} of the tissue, so it cannot be used.")
     return TwinCheck(maps.max_shear)
 
 

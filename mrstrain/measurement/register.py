@@ -40,7 +40,7 @@ def register(
 ) -> Series:  # fmt: skip
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
 
-    A load that fails is named in ``failures``; the others are finished.
+    If a load fails, it is listed in ``failures`` and the other loads are completed.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def register(
     subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
     align = registration.align
     if align == "bone" and subject.bone is None:
-        raise InputError("Aligning on the bone needs it: give its mask (bone) or label (bone_label), or another align.")
+        raise InputError("Alignment on bone needs a bone: give bone or bone_label, or use align image or none.")
     images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
     # Read now: what is wrong with it must not be found after an hour.
     model = None if registration.error_model is None else read_error_model(registration.error_model)
@@ -98,11 +98,11 @@ class InSeries(Running):
     """How one load is registered within its series, and the results that it builds on."""
 
     repeat: Path | None = None
-    """Folder of the repeat scan's results: the noise floor."""
+    """Results folder of the repeat scan, for the noise floor."""
     after: Path | None = None
-    """Folder of the load whose result is the start of this one's."""
+    """Results folder of the load to start from."""
     allow_missing: Flag = False
-    """Leave NaN or infinite voxels out instead of refusing the image."""
+    """Leave NaN and infinite voxels out, instead of refusing the image."""
 
 
 @door
@@ -139,20 +139,22 @@ def _places(loads: list[Path], scans: Scans) -> dict[str, Path]:
         raise InputError("Give at least one loaded image.")
     for name, value in (("landmarks", scans.landmarks), ("start", scans.start)):
         if value is not None and len(loads) != 1:
-            raise InputError(f"{name} belongs to one loaded image; {len(loads)} are given. Register that one alone.")
+            raise InputError(f"{name} is for a single loaded image, but {len(loads)} are given. Register it alone.")
     places = dict(zip(case_names(loads), loads, strict=True))
     if scans.repeat is None:
         return places
     if REPEAT in places:
-        raise InputError(f"A loaded image is called '{REPEAT}', the folder name kept for the repeat scan: rename it.")
+        raise InputError(f"A loaded image is named '{REPEAT}', which is reserved for the repeat scan; rename it.")
     return places | {REPEAT: scans.repeat}
 
 
 def _check_start(scans: Scans, engine: Engine) -> None:
     if scans.start_frame is not None and scans.start is None:
-        raise ParameterError("start_frame is the frame of start, which is not given.")
+        raise ParameterError("start_frame needs start, which is not given.")
     if scans.start is not None and not engine.starts_anywhere:
-        raise ParameterError(f"start is for the engine {DEFAULT}; {engine.family} begins at its own results (chain).")
+        raise ParameterError(
+            f"start is only for {DEFAULT}; {engine.family} can only start from its own results (chain)."
+        )
 
 
 def _shares(running: Running, loads: int) -> tuple[int, int]:

@@ -18,7 +18,7 @@ def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
     source = Path(deformation)
     if source.suffix.lower() in _TRANSFORMS:
         if frame is not None:
-            raise InputError(f"{source}: a transform file is in LPS; a frame is told of displacement images alone.")
+            raise InputError(f"{source}: transform files are always in LPS; frame is only for displacement images.")
         return read_transform(source)
     return read_displacement(source, frame=frame)
 
@@ -38,10 +38,10 @@ def strain(
         An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with tissue
         interfaces (.npz), or a displacement image. All map points of the reference to points of the loaded image.
     subject_files
-        With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement; ``tissue`` is
-        where strain is wanted.
+        With a bone, its rigid motion (least squares over its voxels) is removed from the displacement. Strain is
+        computed in ``tissue``.
     frame : {"LPS", "RAS"}, optional
-        Frame of a displacement image's components, where no JSON file beside it tells.
+        Frame of the components of a displacement image, if no JSON file next to it gives the frame.
     onto
         As in `register`.
 

@@ -17,15 +17,15 @@ class SubjectFiles(Options):
     panel: ClassVar[str] = "Inputs"
 
     bone: Path | None = None
-    """Mask of the bone whose motion is taken out, on the unloaded image."""
+    """Mask of the bone on the unloaded image; the rigid motion of this bone is removed."""
     bone_label: str | None = None
-    """Or: the name of the bone in --labels."""
+    """Name of the bone in --labels, instead of --bone."""
     tissue: Path | None = None
-    """Mask of the body. Default: by a threshold."""
+    """Mask of the body. Default: found by an intensity threshold."""
     labels: Path | None = None
     """Label map of the tissues on the unloaded image."""
     names: Path | None = None
-    """Names of the labels: ITK-SNAP or Slicer table, or CSV."""
+    """Table of the label names: ITK-SNAP, Slicer or CSV."""
 
 
 class MeshAndAxes(Options):
@@ -34,99 +34,103 @@ class MeshAndAxes(Options):
     panel: ClassVar[str] = "Output"
 
     mesh: Path | None = None
-    """Mesh to put displacement and strain on."""
+    """Mesh on which displacement and strain are also written."""
     mesh_unit: Unit = "mm"
-    """Unit of the mesh's coordinates."""
+    """Unit of the mesh coordinates."""
     mesh_frame: Frame = "LPS"
-    """Frame of the mesh's coordinates."""
+    """Frame of the mesh coordinates."""
     plate_normal: Vector | None = None
-    """The plate's outward normal, away from the foot, LPS. Default: 0 0 -1 (patient inferior)."""
+    """Outward normal of the plate, away from the body, LPS. Default: 0 0 -1 (inferior)."""
     shear_direction: Vector | None = None
-    """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior)."""
+    """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior): adds strain in the plate's axes."""
 
 
 def _known_engine(name: str) -> str:
     from dvc.registration.engines import families
 
     if name not in families():
-        raise ValueError(f"there are {' and '.join(families())}")
+        raise ValueError(f"must be {' or '.join(families())}")
     return name
 
 
 class EngineOptions(Options):
-    """What finds the non-rigid part of a registration."""
+    """The engine of the non-rigid registration."""
 
     panel: ClassVar[str] = "Registration"
 
     engine: Annotated[str, AfterValidator(_known_engine)] | None = None
-    """What finds the non-rigid part. Default: gauss-newton; with --preset, elastix."""
+    """Registration engine: gauss-newton or elastix. Default: gauss-newton; with --preset or --parameters, elastix."""
     borders: Flag | None = None
-    """gauss-newton: strain may be discontinuous at interfaces of --labels. Default: with labels. Not for labels that
-    are off by more than a voxel."""
+    """gauss-newton with --labels: allow strain discontinuities at tissue interfaces. Default: on. Switch off for labels
+    that are off by more than a voxel."""
     preset: str | None = None
-    """Named parameters of elastix, such as heel-mr."""
+    """Named elastix parameters, such as heel-mr."""
     parameters: tuple[Path, ...] = ()
-    """elastix parameter file(s) of your own, instead of a preset."""
+    """Your own elastix parameter file, instead of --preset; each file is one stage."""
 
 
 class RegistrationOptions(EngineOptions):
     """How loaded images are registered to the unloaded one."""
 
     align: Literal["bone", "image", "none"] = "bone"
-    """What to align rigidly first."""
+    """What is aligned rigidly before the registration."""
     bending: Positive | None = None
-    """gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."""
+    """gauss-newton: weight of the bending penalty, 1/mm. Default: chosen for each pair by cross-validation."""
     volume: NotNegative | None = None
-    """gauss-newton: weight of the change of volume, 1/mm3. Default: 300, or as the images ask."""
+    """gauss-newton: weight of the volume-change penalty, 1/mm3. Default: 300, relaxed where the images indicate a
+    volume change."""
     chain: Flag = False
     """Start each load from the result of the one before it, in the order given."""
     error_model: Annotated[Path | None, Cli(panel="Advanced")] = None
-    """Error model that `mrstrain accuracy` wrote, instead of the preset's own."""
-    twin: Annotated[Flag, Cli(panel="Output")] = False
-    """Also register each pair's twin, whose strain is known: judges error bars. Twice the time."""
+    """Error model written by `mrstrain accuracy`, instead of the built-in one."""
+    twin: Flag = False
+    """Also register a synthetic warp (twin) of each pair, whose strain is known, to check the error bars. Takes more
+    than twice the time."""
     allow_unknown_parameters: Annotated[Flag, Cli(panel="Advanced")] = False
-    """Accept parameter names we do not know."""
+    """Accept elastix parameter names that mrstrain does not know."""
 
 
 class Scans(Options):
-    """What is known beside the loaded images."""
+    """Inputs in addition to the loaded images."""
 
     panel: ClassVar[str] = "Inputs"
 
     repeat: Path | None = None
-    """A second unloaded image: gives the noise floor."""
+    """Second unloaded image, which measures the noise floor."""
     landmarks: Path | None = None
-    """CSV of landmark pairs (x0,y0,z0,x1,y1,z1 in mm LPS); for a single loaded image."""
+    """Point pairs that measure the registration error: CSV (x0,y0,z0,x1,y1,z1 in mm LPS). Only with one loaded
+    image."""
     start: Annotated[Path | None, Cli(panel="Registration")] = None
-    """What another tool found for one load, to be refined: a transform or displacement image."""
+    """Result of another tool to start from and refine: a transform or displacement image. Only with one loaded
+    image."""
     start_frame: Annotated[Frame | None, Cli(panel="Registration")] = None
-    """Frame of --start, where its file does not tell it."""
+    """Frame of the components of --start, if its file does not give it."""
     allow_missing: Flag = False
-    """Leave NaN or infinite voxels out instead of refusing the image."""
+    """Leave NaN and infinite voxels out, instead of refusing the image."""
 
 
 class Threads(Options):
-    """With how many threads is computed."""
+    """Number of threads."""
 
     panel: ClassVar[str] = "Advanced"
 
     threads: Count | None = None
-    """Threads of each worker. Default: all cores. elastix repeats its results only on the same number of threads."""
+    """Threads per worker. Default: all cores. elastix reproduces its results only with the same number of threads."""
 
 
 class Cores(Threads):
-    """How much is computed at once."""
+    """Number of threads, and of loads at the same time."""
 
     workers: Count | None = None
-    """Loads at once. Default: as many as cores and loads allow."""
+    """Loads computed at the same time. Default: as many as cores and loads allow."""
 
 
 class Seeded(Threads):
-    """With how many threads is computed, and from which random numbers."""
+    """Number of threads, and the seed of random numbers."""
 
     seed: Count = 1
     """Seed of all random numbers."""
 
 
 class Running(Cores, Seeded):
-    """How much is computed at once, and from which random numbers."""
+    """Number of threads, loads at the same time, and the seed of random numbers."""

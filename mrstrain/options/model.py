@@ -32,7 +32,7 @@ def _of_numpy(kind: type, own: type) -> BeforeValidator:
 
 def _once(names: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
-        raise ValueError("each only once")
+        raise ValueError("each name may occur only once")
     return names
 
 
@@ -110,10 +110,10 @@ class Options(BaseModel):
 def reason(error: Mapping[str, Any]) -> str:
     """Why pydantic refuses a value, and the value."""
     if error["type"] == "missing":
-        return "it is needed"
+        return "is required"
     why = error["msg"].removeprefix("Value error, ")
     if error["type"] == "literal_error":
-        why = f"there are {error['ctx']['expected'].replace(' or ', ' and ').replace(chr(39), '')}"
+        why = f"must be {error['ctx']['expected'].replace(chr(39), '')}"
     given = repr(error["input"])
     return f"{why}; got {given if len(given) < _SHORT else type(error['input']).__name__}"
 

@@ -21,9 +21,10 @@ class Labelling(Options):
     panel: ClassVar[str] = "Inputs"
 
     names: Path | None = None
-    """Names of the labels: ITK-SNAP or Slicer table, or CSV."""
+    """Table of the label names: ITK-SNAP, Slicer or CSV."""
     bones: Annotated[Names, Field(min_length=1), Cli("--bone")] = ("bone",)
-    """Label of bone. It is cut out of meshes and its surface fixed; slices go through the lowest point of the first."""
+    """Name of a bone label. Bones are cut out of the mesh and their surfaces are fixed; slices in figures go through
+    the lowest point of the first bone."""
 
 
 class LabelMapFile(Labelling):
@@ -46,11 +47,11 @@ class Meshing(Options):
     panel: ClassVar[str] = "Model"
 
     edge_mm: Positive = 2.0
-    """Length of edges wanted, mm; beyond four voxels these set it."""
+    """Edge length of the cells, mm. Above about four voxels a longer edge changes little."""
     finer: Finer | None = None
-    """Another edge length in one region, mm, such as skin 1."""
-    limit_s: Annotated[Positive, _limit("Time after which meshing is given up.")] = 3600.0
-    """Time after which meshing is given up, s."""
+    """Another edge length in one region, mm, such as: skin 1."""
+    limit_s: Annotated[Positive, _limit("Stop meshing after this time, minutes.")] = 3600.0
+    """Stop meshing after this time, s."""
 
 
 class MeshCoordinates(Options):
@@ -59,9 +60,9 @@ class MeshCoordinates(Options):
     panel: ClassVar[str] = "Inputs"
 
     mesh_unit: Unit = "mm"
-    """Unit of the mesh's coordinates."""
+    """Unit of the mesh coordinates."""
     mesh_frame: Frame = "LPS"
-    """Frame of the mesh's coordinates."""
+    """Frame of the mesh coordinates."""
 
 
 class Directions(Options):
@@ -70,7 +71,7 @@ class Directions(Options):
     panel: ClassVar[str] = "Model"
 
     plate_normal: Vector = (0.0, 0.0, -1.0)
-    """The plate's outward normal, away from the foot, LPS. Default: 0 0 -1 (patient inferior)."""
+    """Outward normal of the plate, away from the body, LPS. Default: 0 0 -1 (inferior)."""
     shear_direction: Vector = (0.0, -1.0, 0.0)
     """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior)."""
 
@@ -79,26 +80,28 @@ class HeelShape(Options):
     """Shape of a synthetic heel; ranges as in `phantoms.Heel`."""
 
     size: Real = 1.0
-    """Factor on all shapes; 1 is a calcaneus 67 mm long."""
+    """Scale factor of all shapes; 1 is a calcaneus 67 mm long."""
     pad_mm: Annotated[Real, Cli("--pad")] = 18.0
-    """Tissue below the calcaneus, skin included, mm."""
+    """Thickness of the tissue below the calcaneus, with the skin, mm."""
     skin_mm: Annotated[Real, Cli("--skin")] = 2.0
     """Thickness of the skin, mm."""
     lobule_mm: Annotated[Real, Cli("--lobules")] = 6.0
-    """Width of the fat's lobules, mm."""
+    """Width of the fat lobules, mm."""
 
 
 class PlateOptions(Directions):
     """The rigid plate that presses and shears."""
 
-    taped: Annotated[Flag, Cli("--slide", "No tape: skin slides along the plate without friction.", off=True)] = True
-    """Skin that has touched the plate holds to it; if not, it slides without friction."""
+    taped: Annotated[
+        Flag, Cli("--slide", "Let the skin slide along the plate without friction (no tape).", off=True)
+    ] = True
+    """Skin that has touched the plate sticks to it; otherwise it slides without friction."""
     gap_mm: NotNegative = 0.0
-    """Distance of the plate from the skin at the start, mm."""
+    """Distance between plate and skin at the start, mm."""
     turns: Flag = False
-    """The plate turns freely about its pivot."""
+    """Let the plate rotate freely about its pivot."""
     pivot_mm: Annotated[Vector | None, Cli("--pivot")] = None
-    """Point over which the plate's pivot lies, LPS mm. Default: where it touches first."""
+    """Point over which the pivot of the plate is placed, LPS mm. Default: the first point of contact."""
 
 
 class MaterialSets(Options):
@@ -107,7 +110,7 @@ class MaterialSets(Options):
     panel: ClassVar[str] = "Model"
 
     sets: Annotated[Names, Cli("--set")] = ("trebbi",)
-    """akrami, erdemir, friedman, luboz, spears, trebbi, zwam, or a .toml of your own. Default: trebbi."""
+    """Material set: akrami, erdemir, friedman, luboz, spears, trebbi, zwam, or your own .toml. Default: trebbi."""
 
 
 class Followed(Options):
@@ -116,24 +119,26 @@ class Followed(Options):
     panel: ClassVar[str] = "Model"
 
     region: str = "fat"
-    """Region whose maximum shear strain is followed."""
+    """Region whose maximum shear strain is compared between meshes."""
     material: Annotated[str, Cli("--set")] = "trebbi"
-    """Material set."""
+    """Material set of all meshes."""
 
 
 class SimulationOptions(MaterialSets):
     """Which material sets are simulated, and how."""
 
     fixed: Annotated[Names, Cli("--fix")] = ()
-    """Facets that do not move, beside the bone's, such as cut."""
+    """Surface set that is fixed in addition to the bone, such as cut."""
     element: Literal["P1", "MINI", "P2"] = "P1"
-    """P1 (fast), MINI, or P2 (quadratic: more exact, slow)."""
+    """Finite element: P1 (linear, fast), MINI, or P2 (quadratic: more accurate, slow)."""
     decks: Annotated[Flag, Cli(panel="Output")] = False
-    """Also write each load for CalculiX and FEBio."""
+    """Also write input files of each load for CalculiX and FEBio."""
     limit_s: Annotated[
-        Positive | None, _limit("Time after which a path of loads ends where it stands. Default: none.")
+        Positive | None,
+        _limit("End a load path after this time, minutes, at its last converged increment. Default: no limit."),
     ] = None
-    """Time after which a set's path of loads ends at its last equilibrium, s; with more it goes on from there."""
+    """End the load path of a material set after this time, s, at its last converged increment. A later run with a
+    longer time continues from there."""
 
 
 class ModelReading(Options):
@@ -142,11 +147,11 @@ class ModelReading(Options):
     panel: ClassVar[str] = "Model"
 
     model_mesh: Path | None = None
-    """Mesh of nodal displacements in .csv files."""
+    """Mesh of the models, if their results are nodal displacements in .csv files."""
     model_unit: Unit = "mm"
-    """Unit of the mesh's coordinates."""
+    """Unit of the model coordinates."""
     model_frame: Frame = "LPS"
-    """Frame of the mesh's coordinates."""
+    """Frame of the model coordinates."""
 
 
 def _rising(strains: tuple[float, float]) -> tuple[float, float]:
@@ -162,17 +167,17 @@ class ComparisonOptions(Options):
     panel: ClassVar[str] = "Comparison"
 
     strains: Annotated[tuple[Real, Real], AfterValidator(_rising)] = (0.2, 0.5)
-    """Range of maximum shear strain of the areas."""
+    """Range of maximum shear strain over which the area metric is computed."""
     thresholds: Path | None = None
-    """CSV: max_shear, source. Levels for clusters."""
+    """Strain thresholds of the clusters: CSV with the columns max_shear, source."""
     least_ml: NotNegative = 0.1
-    """Volume of the smallest cluster that counts, mL."""
+    """Smallest volume of a cluster that counts, mL."""
 
 
 class ComparisonOn(ComparisonOptions):
     """What is compared, and where it is put."""
 
     mesh: Path | None = None
-    """Where to compare. Default: the first model's mesh."""
+    """Mesh on which the comparison is made. Default: the mesh of the first model."""
     on_image: Annotated[Flag, Cli(panel="Output")] = False
-    """Also each model's displacement and strain on the image's voxels."""
+    """Also write the displacement and strain of each model on the voxels of the image."""

@@ -58,7 +58,7 @@ def examine(
     checked. ``trials`` are short trial runs by name; each returns a line on how it went, or raises.
     """
     foreign = " ".join(_foreign_packages())
-    detail = foreign or f"{', '.join(_OURS)} are mrstrain's own"
+    detail = foreign or f"{', '.join(_OURS)} belong to mrstrain"
     own = Finding("package names", not foreign, detail, "Install mrstrain in an environment of its own.")
     findings = [_python(), own, *map(_package, _NEEDED), _cores(), _memory(), _disk(Path(folder)), _temporary()]
     return [*findings, *(_tried(what, trial) for what, trial in (trials or {}).items())]
@@ -87,8 +87,8 @@ def _foreign_packages() -> list[str]:
             continue
         if _brings(rival, package):
             reasons.append(
-                f"The distribution {name}{title} {rival.version} is installed here, and its package {package!r} has "
-                "the name of one of mrstrain's."
+                f"The distribution {name}{title} {rival.version} is installed in the same environment, and its package "
+                f"{package!r} has the same name as one of mrstrain."
             )
     for package in _OURS:
         try:
@@ -97,8 +97,8 @@ def _foreign_packages() -> list[str]:
             spec = None
         places = [Path(place).resolve() for place in spec.submodule_search_locations or ()] if spec else []
         if home / package not in places:
-            found = spec.origin if spec and spec.origin else "nowhere"
-            reasons.append(f"The package {package!r} should be in {home} and is found in {found}.")
+            found = f"found in {spec.origin}" if spec and spec.origin else "not found"
+            reasons.append(f"The package {package!r} should be in {home}, but is {found}.")
     return reasons
 
 
@@ -123,7 +123,7 @@ def _package(name: str) -> Finding:
     except importlib.metadata.PackageNotFoundError:
         wheels = "; wheels: Linux (glibc 2.28), macOS 15 on Apple silicon, Windows x64" if ours else ""
         return Finding(name, False, "not installed", f"pip install {name}{wheels}")
-    advice = f"pip install 'itk-elastix=={_ELASTIX}*': parameters are checked against it."
+    advice = f"pip install 'itk-elastix=={_ELASTIX}*' (parameter names are checked against this version)."
     return Finding(name, not ours or version.startswith(_ELASTIX), version, advice)
 
 
@@ -140,7 +140,7 @@ def _memory() -> Finding:
     if total is None:
         return Finding("memory", True, "not known on this system")
     needed = f"A pair of 256 x 256 x 256 voxels takes up to {_LEAST_MEMORY_GIB:.0f} GiB"
-    advice = f"{needed}: crop the images, or use a larger machine."
+    advice = f"{needed}. Crop the images, or use a machine with more memory."
     return Finding("memory", total >= _LEAST_MEMORY_GIB * _GIB, f"{total / _GIB:.1f} GiB", advice)
 
 
@@ -159,7 +159,7 @@ def _disk(folder: Path) -> Finding:
     if not os.access(existing, os.W_OK):
         return Finding("disk", False, f"{existing} is not writable", "Choose another folder for the results.")
     free, needed = shutil.disk_usage(existing).free, f"Results of one loaded image take up to {_LEAST_DISK_GIB:.0f} GiB"
-    advice = f"{needed}: make room, or choose another folder."
+    advice = f"{needed}. Free disk space, or choose another folder."
     return Finding("disk", free >= _LEAST_DISK_GIB * _GIB, f"{free / _GIB:.1f} GiB free for results", advice)
 
 
@@ -177,5 +177,5 @@ def _tried(what: str, trial: Callable[[], str]) -> Finding:
     try:
         return Finding(f"trial of {what}", True, trial())
     except Exception as error:  # must not end the examination
-        advice = "Reinstall mrstrain in an environment of its own; the line above is what the trial said."
+        advice = "The line above is the error of the trial. Reinstall mrstrain in an environment of its own."
         return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)

@@ -26,9 +26,9 @@ def read_subject(
     if files.labels is not None:
         label_map = fit_mask(read_labels(files.labels, files.names), reference.grid, str(files.labels))
     elif files.names is not None or files.bone_label is not None:
-        raise InputError("names and bone_label speak of a label map: give it, too (labels).")
+        raise InputError("names and bone_label need a label map (labels).")
     if files.bone is not None and files.bone_label is not None:
-        raise InputError("Give the bone once: as a mask (bone) or as a label of the map (bone_label).")
+        raise InputError("The bone was given twice: use either the mask (bone) or the label (bone_label).")
     bone = None if files.bone is None else read_mask(files.bone, reference.grid)
     if files.bone_label is not None and label_map is not None:
         bone = label_map.region(files.bone_label)
@@ -38,7 +38,7 @@ def read_subject(
         if not reference.grid.contains(mesh.points_mm).any():
             low, high = mesh.bounds_mm
             raise InputError(
-                f"{onto.mesh}: no node lies in the unloaded image. The mesh spans {np.round(low, 1).tolist()} to "
+                f"{onto.mesh}: no node is inside the unloaded image. The mesh spans {np.round(low, 1).tolist()} to "
                 f"{np.round(high, 1).tolist()} mm (LPS); the image: {reference.grid}. Check mesh_unit and "
                 "mesh_frame."
             )
@@ -52,9 +52,9 @@ def read_matrix(path: Path) -> FloatArray:
     try:
         matrix = np.loadtxt(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: no matrix of four rows of four numbers ({error}).") from error
+        raise InputError(f"{path}: not a matrix of four rows of four numbers ({error}).") from error
     if matrix.shape != (4, 4):
-        raise InputError(f"{path}: a matrix of shape {matrix.shape}; 4 x 4 is needed.")
+        raise InputError(f"{path}: the matrix has shape {matrix.shape}; 4 x 4 is needed.")
     return np.asarray(matrix, dtype=np.float64)
 
 
@@ -69,8 +69,8 @@ def case_names(loads: Sequence[Path]) -> list[str]:
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise InputError(
-            f"Results are kept in a folder named after each loaded image, and {twice} would be used twice: "
-            "rename the files, or register them into different folders (out)."
+            f"Each loaded image gets a results folder of its file name, but {twice} would be used twice. Rename the "
+            "files, or use different output folders (out)."
         )
     return names
 
@@ -82,7 +82,7 @@ def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Seque
         for case in case_folders:
             if (out / case).resolve() in path.resolve().parents:
                 raise OutputError(
-                    f"{out / case} would be replaced, and the input {path} lies in it. Choose another folder (out)."
+                    f"{out / case} would be replaced, but it has the input {path}. Choose another folder (out)."
                 )
 
 
@@ -95,8 +95,8 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") ->
     free = shutil.disk_usage(there).free
     if free < needed:
         raise OutputError(
-            f"{out}: {what} about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free some, choose "
-            f"another folder (out){instead}."
+            f"{out}: {what} about {needed / 1e6:.0f} MB, but the disk has only {free / 1e6:.0f} MB left. Free disk "
+            f"space, choose another folder (out){instead}."
         )
 
 
@@ -110,5 +110,5 @@ def make_output(out: Path) -> None:
     except OSError as error:
         raise OutputError(
             f"{out}: results cannot be written here ({error.strerror or error}). Choose another folder (out), or "
-            "change its rights."
+            "change its permissions."
         ) from error

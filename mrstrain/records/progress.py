@@ -34,7 +34,7 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
         else:
             yield _lines_of_all() if of_all else _lines()
     except KeyboardInterrupt:
-        console.print("Interrupted. What was finished is kept; nothing half-written is.")
+        console.print("Interrupted. Finished results are kept; incomplete ones are not.")
         raise
 
 

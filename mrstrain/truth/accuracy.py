@@ -92,8 +92,8 @@ def accuracy(
     wanted = list(accuracy_cases() if cases is None else cases)
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            "An accuracy study needs at least one case, and each only once (an engine that needs labels has "
-            "no waves: they move bone)."
+            "An accuracy study needs at least one case, and each case only once. An engine that needs labels has no "
+            "wave motions, because they also deform bone."
         )
     for case in wanted:
         _check(case)
@@ -107,8 +107,8 @@ def accuracy(
     at_once = max(1, min(workers or usable_cores(), len(missing)))
     if tell_plan is not None:
         tell_plan(
-            f"{len(missing)} registrations to do ({len(wanted) - len(missing)} are there already), about "
-            f"{expected_minutes(missing, at_once):.0f} minutes with {at_once} at once."
+            f"{len(missing)} registrations to run ({len(wanted) - len(missing)} are already done): about "
+            f"{expected_minutes(missing, at_once):.0f} minutes with {at_once} at a time."
         )
     failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
     if not runs:
@@ -133,8 +133,8 @@ def _refuse_one_name_for_two(cases: Sequence[AccuracyCase]) -> None:
         other = named.setdefault(Path(case.preset).stem, case.preset)
         if other != case.preset:
             raise InputError(
-                f"{other} and {case.preset} would share the name '{Path(other).stem}' in this study: rename one, or "
-                "measure it in another folder (out)."
+                f"{other} and {case.preset} would have the same name '{Path(other).stem}' in this study. Rename one, "
+                "or use another folder (out)."
             )
 
 
@@ -143,13 +143,13 @@ def _check(case: AccuracyCase) -> None:
     heel_grid(case.spacing_mm)
     motion = motion_named(Heel(case.seed), case.motion)
     if case.wavelength_mm is not None and not case.wavelength_mm >= 2.0 * max(case.spacing_mm):
-        raise InputError(f"{case.motion}: a wave needs at least two voxels of {max(case.spacing_mm):g} mm.")
+        raise InputError(f"{case.motion}: the wavelength must be at least two voxels of {max(case.spacing_mm):g} mm.")
     if not 1.0 <= case.snr <= 1000.0:
-        raise InputError(f"The SNR must lie between 1 and 1000; got {case.snr}.")
+        raise InputError(f"The SNR must be between 1 and 1000; got {case.snr}.")
     points = np.random.default_rng(0).uniform([-32, -50, -44], [32, 44, 40], (2000, 3))
     lowest = 1.0 if motion is None else float(np.linalg.det(motion.evaluate(points)[1] + np.eye(3)).min())
     if not lowest > 0.0:
-        raise InputError(f"The motion '{case.motion}' folds (det F = {lowest:.2f}); no image can show it.")
+        raise InputError(f"The motion '{case.motion}' folds (det F = {lowest:.2f}), which is not possible in an image.")
 
 
 def _key(case: AccuracyCase) -> str:

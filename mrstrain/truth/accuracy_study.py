@@ -25,8 +25,8 @@ _HOW_TO_READ = (
     "bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as strong as under"
     " the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength L mm). Labels +1 or"
     " -1: bones and skin are one voxel too large, or too small, in the label map that the registration was given.",
-    "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. Finer resolution costs"
-    " noise, so report both together.",
+    "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. A finer resolution "
+    "means more noise, so report both.",
     "Bias and SD in the error model are conditional on the measured shear. They apply to tissue strained and imaged "
     "like these phantoms; scanner distortion and creep during a scan are not included.",
 )
@@ -107,7 +107,7 @@ class AccuracyStudy:
             sections.append(_coverage_section(self.coverage))
         if self.failures:
             table = Table("Failures", ("case", "reason"), tuple(self.failures.items()))
-            sections.append(Section("Without a result", tables=(table,)))
+            sections.append(Section("Failed cases", tables=(table,)))
         return sections
 
 
@@ -123,8 +123,8 @@ def _source(runs: Sequence[ErrorSamples]) -> str:
 
 
 _OF_FLOOR = (
-    "MAER is the mean over voxels of the mean absolute value of the six strain components, SDER the standard deviation "
-    "of the same."
+    "MAER is the mean over voxels of the mean absolute value of the six strain components; SDER is its standard "
+    "deviation over voxels."
 )
 
 
@@ -145,9 +145,9 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
     if floors:
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
         noise = tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in floors)
-        tables.append(Table("Noise floor: apparent strain without load", of_floor, noise, _OF_FLOOR))
+        tables.append(Table("Noise floor: apparent strain between two unloaded scans", of_floor, noise, _OF_FLOOR))
     pictures = tuple(
-        Picture.drawn(f"Error by {by.split(',')[0]}", figures.errors_by_place, errors, by)
+        Picture.drawn(f"Error by {figures.words(by).split(',')[0]}", figures.errors_by_place, errors, by)
         for by in ("distance to bone, mm", "distance to a border, mm", "true maximum shear strain")
     )
     preset, voxel, snr = errors[0].condition
@@ -157,15 +157,15 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
     table = Table(
         "Coverage of the error model",
-        (*_CONDITION, "motion", "tissue", "voxels, %", "remaining error, mean", "tissue's figures, %"),
+        (*_CONDITION, "motion", "tissue", "voxels covered, %", "remaining error, mean", "figures covered, %"),
         tuple(
             (*r.condition, r.motion, r.tissue, 100 * r.voxels_within, r.left_over, 100 * r.figures_within) for r in rows
         ),
-        "Each heel is compared with a model fitted to the other heels under the same motions. Voxels: truth within "
-        "1.96 SD, 95 % if the model is right. Figures: percentiles and volumes within the intervals that `register` "
-        "would give.",
+        "Each heel is compared with a model fitted to the other heels under the same motions. Voxels covered: truth "
+        "within 1.96 SD; 95 % if the model is correct. Figures covered: percentiles and volumes of the tissue within "
+        "the intervals that `register` would give.",
     )
-    return Section("Does the error model hold?", tables=(table,))
+    return Section("Validation of the error model", tables=(table,))
 
 
 def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow]) -> Section:

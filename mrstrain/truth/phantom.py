@@ -81,10 +81,10 @@ def phantom(
     heel = Heel(seed, **dict(shape))
     grid = heel_grid(spacing_mm, heel.size)
     if snr is not None and not 1.0 <= snr <= 1000.0:
-        raise InputError(f"The SNR (snr) must lie between 1 and 1000, or be None for no noise; got {snr}.")
+        raise InputError(f"The SNR (snr) must be between 1 and 1000, or None for no noise; got {snr}.")
     motions = {load: under_load(heel, load) for load in loads}
     if not motions:
-        raise InputError(f"Name at least one load out of {', '.join(LOADS)}.")
+        raise InputError(f"Give at least one load: {', '.join(LOADS)}.")
     target = Path(out)
     needed = _BYTES_PER_VOXEL * int(np.prod(grid.shape)) * (len(motions) + 2)
     refuse_small_disk(target, needed, "the images need", ", larger voxels or fewer loads")

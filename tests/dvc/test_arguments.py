@@ -47,16 +47,16 @@ def test_what_fits_is_taken(given: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"image": "a.nii"}, r"^image must be a dvc\.Image: .*read_image.*; got 'a\.nii'\.$"),
+        ({"image": "a.nii"}, r"^image must be a dvc\.Image, .*read_image.*; got 'a\.nii'\.$"),
         ({"image": IMAGE.values}, r"^image must be .*; got ndarray of shape \(3, 3, 3\)\.$"),
         ({"number": "2"}, "^number must be a number; got '2'"),
         ({"count": 1.5}, "^count must be a whole number; got 1.5"),
-        ({"names": "bone"}, "^names must be a list, with each text .*; got 'bone'"),
+        ({"names": "bone"}, "^names must be a list, each item text .*; got 'bone'"),
         ({"names": ["a", 3]}, r"^names\[1\] must be text \(str\); got 3"),
         ({"pair": ("a", "b")}, r"^pair\[1\] must be a number; got 'b'"),
         ({"pair": ("a", 1.0, 2.0)}, r"^pair must be \(text \(str\), a number\); got tuple"),
         ({"by_name": {"a": IMAGE}}, r"^by_name\['a'\] must be a dvc\.Mask.*; got Image"),
-        ({"by_name": [MASK]}, "^by_name must be a dict, with each value a dvc.Mask.*; got list"),
+        ({"by_name": [MASK]}, "^by_name must be a dict, each value a dvc.Mask.*; got list"),
         ({"file": 3}, "^file must be the path of a file or folder .*; got 3"),
         ({"values": "z"}, "^values must be an array of numbers; got 'z'"),
     ],
@@ -75,7 +75,7 @@ MEASURE: list[tuple[dict[str, Any], str]] = [
     ({"start": "u.nii.gz"}, "^start must be a deformation.*; got 'u.nii.gz'"),
     ({"error_model": "em.json"}, "^error_model must be a dvc.ErrorModel.*; got 'em.json'"),
     ({"landmarks": "lm.csv"}, "^landmarks must be .*; got 'lm.csv'"),
-    ({"plate_normal": "z"}, "^plate_normal must be a list, with each a number; got 'z'"),
+    ({"plate_normal": "z"}, "^plate_normal must be a list, each item a number; got 'z'"),
     ({"mesh": dome((2, 3, 3))}, "^mesh must be a dvc.MeshFile.*; got TetMesh"),
 ]
 
@@ -94,14 +94,14 @@ def test_others_refuse_as_well() -> None:
         (lambda: dvc.Settings(threads="2"), "threads must be a whole number; got '2'"),
         (lambda: dvc.GaussNewton(bending="3"), "bending must be a number; got '3'"),
         (lambda: dvc.Image(IMAGE.values, GRID), "grid must be a dvc.Grid"),
-        (lambda: dvc.Image(GRID, "a.nii"), "Numbers are needed; got 'a.nii'"),
+        (lambda: dvc.Image(GRID, "a.nii"), "An array of numbers is needed; got 'a.nii'"),
         (lambda: phantoms.heel_pair((34, 38, 36), 3.0), "seed must be a whole number; got tuple"),
         (lambda: phantoms.heel_pair(1, (34, 38, 36), 0.003), "between 0.05 and 20 mm; got 0.003"),
         (lambda: phantoms.heel_pair(motion="sliding"), "motion must be .*; got 'sliding'"),
         (lambda: fe.LoadStep(2.0, "p"), "name must be text .*; got 2.0"),
         (lambda: fe.LoadStep("p", normal_n="2"), "normal_n must be a number; got '2'"),
-        (lambda: fe.Plate("-x", (0, 1, 0)), "Numbers are needed; got '-x'"),
-        (lambda: fe.Ogden.from_abaqus("a", 6.2), "Numbers are needed"),
+        (lambda: fe.Plate("-x", (0, 1, 0)), "An array of numbers is needed; got '-x'"),
+        (lambda: fe.Ogden.from_abaqus("a", 6.2), "An array of numbers is needed"),
         (lambda: fe.mesh_labels(LABELS, "5"), "edge_mm must be a number; got '5'"),
         (lambda: fe.mesh_labels("a.nii", 5.0), "labels must be a dvc.LabelMap.*; got 'a.nii'"),
         (lambda: fe.mesh_labels(LABELS, 5.0, bones="bone"), "bones must be a list.*; got 'bone'"),
@@ -121,18 +121,18 @@ def test_points_have_three_coordinates_each(shape: tuple[int, ...]) -> None:
     spline = dvc.BSpline(dvc.Grid((6, 6, 6), (1.0,) * 3, (0.0,) * 3), np.zeros((3, 6, 6, 6)))
     for deformation in (OnMesh(mesh, np.zeros_like(mesh.points_mm)), spline, dvc.Affine(np.eye(3), np.zeros(3))):
         for evaluate in (deformation.evaluate, deformation.displacement):
-            with pytest.raises(InputError, match=r"Points are an array \(n, 3\), LPS mm; got shape"):
+            with pytest.raises(InputError, match=r"Points must be an array \(n, 3\), LPS mm; got shape"):
                 evaluate(points)
-    with pytest.raises(InputError, match="One point is"):
+    with pytest.raises(InputError, match="One point:"):
         as_points(points)
 
 
 def test_labels_are_no_mask_and_grey_values_no_labels() -> None:
     numbers = np.arange(27).reshape(3, 3, 3)
-    with pytest.raises(InputError, match=r"these are labels\. Choose one"):
+    with pytest.raises(InputError, match=r"these are labels\. Select one"):
         dvc.Mask(GRID, numbers)
     assert dvc.Mask(GRID, numbers % 2).inside.sum() == 13
-    with pytest.raises(InputError, match="Labels are whole numbers; these are not"):
+    with pytest.raises(InputError, match="Labels must be whole numbers"):
         dvc.LabelMap(GRID, LABELS.labels + 0.7, {1: "bone"})
     assert dvc.LabelMap(GRID, LABELS.labels.astype(float), {1: "bone"}).labels.dtype == np.int64
 

@@ -172,14 +172,14 @@ def test_materials_may_be_given_by_region_or_by_the_name_of_their_set() -> None:
 @pytest.mark.parametrize(
     ("argument", "given", "said"),
     [
-        (0, "heel.vtu", r"^mesh must be a TetMesh, as fe\.read_tet_mesh\(file\) .*; got 'heel\.vtu'"),
+        (0, "heel.vtu", r"^mesh must be a TetMesh, from fe\.read_tet_mesh\(file\) .*; got 'heel\.vtu'"),
         (0, np.zeros((4, 3)), r"^mesh must be a TetMesh.*; got ndarray of shape \(4, 3\)"),
         (1, "trebi", "No material set 'trebi'; the nearest is 'trebbi'"),
         (1, {"fat": "trebbi"}, r"^materials\['fat'\] must be a material, such as fe\.Ogden.*; got 'trebbi'"),
         (1, 0.0034, r"^materials must be a set .*fe\.material_set.*; got 0.0034"),
         (2, (DOWN, ALONG), r"^plate must be a fe\.Plate, .*; got tuple"),
         (2, {"other": fe.Plate(DOWN, ALONG)}, "plate has none for pressed; it has one for other"),
-        (3, LOADS[0], r"^loads must be a list, with each a fe\.LoadStep.*; got LoadStep"),
+        (3, LOADS[0], r"^loads must be a list, each item a fe\.LoadStep.*; got LoadStep"),
         (3, [{"name": "pressed", "normal_n": 2.0}], r"^loads\[0\] must be a fe\.LoadStep.*; got dict"),
         (3, "pressed", "^loads must be a list.*; got 'pressed'"),
     ],

@@ -176,10 +176,10 @@ def test_refuses_bad_shapes() -> None:
     with pytest.raises(InputError, match="forms"):
         EllipsoidUnion(np.zeros((2, 3)), np.eye(3)[None])
     body = EllipsoidUnion(np.zeros((1, 3)), np.eye(3)[None])
-    with pytest.raises(InputError, match="ramp > 0"):
+    with pytest.raises(InputError, match="`ramp` must be above 0"):
         Border(body, 0.0)
     rest = Border(body, 1.0)
-    with pytest.raises(InputError, match="width_mm must be positive"):
+    with pytest.raises(InputError, match="width_mm of a flow must be positive"):
         Flow(np.zeros(3), np.zeros(3), rest, np.zeros(3), np.array([1.0, 0.0, 1.0]))
     with pytest.raises(InputError, match="pivot_mm needs three"):
         Flow(np.zeros(3), np.zeros(2), rest, np.zeros(3), np.ones(3))

@@ -86,7 +86,7 @@ def test_refuses_what_is_no_motion() -> None:
         stretched(np.array([1.0, -1.0, 1.0]), CENTRE)
     with pytest.raises(InputError, match="positive stretch"):
         compressed(0, 0.0, CENTRE)
-    with pytest.raises(InputError, match="right angles"):
+    with pytest.raises(InputError, match="perpendicular unit vectors"):
         sheared(X, X + Z, 0.1, CENTRE)
     with pytest.raises(InputError, match="wavelength"):
         ShearWave(X, Y, 0.0, 0.1)

@@ -49,7 +49,7 @@ def read_dicom(place: Path, *, series: str | None = None, max_bytes: int = MAX_B
     frames = _frames_in(place) if place.is_dir() else _frames_of_one(place)
     stacks = _named_stacks(_stacks_of(frames))
     if not stacks:
-        raise ImageFileError(f"{place}: no DICOM image in this folder (subfolders are not searched).")
+        raise ImageFileError(f"{place}: no DICOM images in this folder (subfolders are not searched).")
     grid, ordered = _assembled(place, _pick_stack(place, stacks, series).frames)
     refuse_if_too_large(place, grid.shape, max_bytes)
     return grid, read_values(ordered).transpose(2, 1, 0)
@@ -60,21 +60,21 @@ def _frames_in(folder: Path) -> list[Frame]:
     contents = [read_frames(path) for path in paths if is_dicom(path)]
     for (_, total), held in Counter(part for _, part in contents if part).items():
         if held != total:
-            stored = f"an image that was stored in {total} files, of which {held} are here"
+            stored = f"the image is stored in {total} files, but only {held} are in this folder"
             raise ImageFileError(f"{folder}: {stored}. Export the whole series.")
     frames = [frame for own, _ in contents for frame in own]
     skipped = len(paths) - sum(bool(own) for own, _ in contents)
     if skipped and frames:
-        _log.info("%s: %d files that are no DICOM images left out", folder, skipped)
+        _log.info("%s: %d files are not DICOM images and were skipped", folder, skipped)
     return frames
 
 
 def _frames_of_one(path: Path) -> list[Frame]:
     frames, part = read_frames(path)
     if not frames:
-        raise ImageFileError(f"{path}: a DICOM file without an image, such as a report. Give the image.")
+        raise ImageFileError(f"{path}: this DICOM file has no image; it may be a report. Pass the image.")
     if len(frames) == 1 or (part and part[1] > 1):
-        raise ImageFileError(f"{path}: one file of a DICOM series. Give its folder instead: {path.parent}")
+        raise ImageFileError(f"{path}: this is one file of a DICOM series. Pass its folder instead: {path.parent}")
     return frames
 
 
@@ -87,23 +87,23 @@ def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
     positions = np.array([s.position_mm for s in ordered])
     along = positions @ normal
     if len(ordered) < 2:
-        raise ImageFileError(f"{place}: a single slice ({ordered[0].name}); a volume is needed.")
+        raise ImageFileError(f"{place}: the image is a single slice ({ordered[0].name}); a volume is needed.")
     steps = np.diff(along)
     twice = np.flatnonzero(steps < _SAME_PLACE_MM)
     if len(twice):
         pairs = "; ".join(f"{ordered[t].name} and {ordered[t + 1].name}" for t in twice[:3])
         if any(ordered[t].number is not None and ordered[t].path == ordered[t + 1].path for t in twice):
-            cause = f"The file holds several volumes and does not say which frame belongs to which. {CONVERT}"
+            cause = f"The file has several volumes, but does not state the volume of each frame. {CONVERT}"
         else:
-            cause = "Two acquisitions or copies are mixed: keep one of each."
-        raise ImageFileError(f"{place}: {len(twice)} slices lie where another one does ({pairs}). {cause}")
+            cause = "Two acquisitions or copies are mixed; keep only one."
+        raise ImageFileError(f"{place}: {len(twice)} slices have the position of another slice ({pairs}). {cause}")
     usual = float(np.median(steps))
     gaps = np.flatnonzero(steps > 1.5 * usual)
     if len(gaps):
         first, before, after = steps[gaps[0]], ordered[gaps[0]].name, ordered[gaps[0] + 1].name
         raise ImageFileError(
-            f"{place}: slices are missing: {len(gaps)} gaps in a stack with a slice every {usual:.4g} mm; the first, "
-            f"of {first:.4g} mm, between {before} and {after}. Export the whole series."
+            f"{place}: slices are missing. The stack has {len(gaps)} gaps at a slice spacing of {usual:.4g} mm; the "
+            f"first, of {first:.4g} mm, is between {before} and {after}. Export the whole series."
         )
     spacing = float(along[-1] - along[0]) / (len(ordered) - 1)
     uneven = float(np.abs(along - along[0] - spacing * np.arange(len(ordered))).max())
@@ -111,8 +111,9 @@ def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
     column_spacing, row_spacing = stack[0].spacing_mm
     if uneven > _OFF_PLACE * spacing or aside > _OFF_PLACE * min(column_spacing, row_spacing):
         raise ImageFileError(
-            f"{place}: the slices are not evenly stacked: up to {uneven:.3g} mm off an even spacing of {spacing:.4g} "
-            f"mm, and up to {aside:.3g} mm sideways (tilted gantry). Resample the series to a regular grid first."
+            f"{place}: the slices are not evenly stacked. They deviate by up to {uneven:.3g} mm from an even spacing "
+            f"of {spacing:.4g} mm, and by up to {aside:.3g} mm sideways (tilted gantry). Resample the series to a "
+            "regular grid first."
         )
     direction = np.stack([x, np.cross(normal, x), normal], axis=1)
     sizes = np.array([column_spacing, row_spacing, spacing])
@@ -214,15 +215,15 @@ def _pick_stack(place: Path, stacks: dict[str, _Stack], series: str | None) -> _
     lines = [f"  {name}: {stack.describe()}" for name, stack in stacks.items()]
     if len(lines) > _LISTED:
         lines[_LISTED:] = [f"  and {len(lines) - _LISTED} more, named in the same way"]
-    what, move = "file", "Write one"
+    what, move = "file", "Write one image"
     if place.is_dir():
-        what, move = "folder", "Move the files of one into a folder of its own, or write it"
-    problem = f"series='{series}' fits {len(matching)} of the DICOM series in this {what}"
+        what, move = "folder", "Move the files of one image to a folder of its own, or write it"
+    problem = f"series='{series}' matches {len(matching)} of the DICOM series in this {what}"
     if series is None:
         several = len({stack.series for stack in stacks.values()})
-        problem = f"the {what} holds {f'{several} DICOM series' if several > 1 else _SEVERAL}; one is needed"
+        problem = f"the {what} has {f'{several} DICOM series' if several > 1 else _SEVERAL}, but one image is needed"
     raise InputError(
-        f"{place}: {problem}. {move} to a file: in Python, "
-        f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)) with a NAME out of this list:\n'
+        f"{place}: {problem}. {move} to a file in Python: "
+        f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)), with a NAME from this list:\n'
         + "\n".join(lines)
     )

@@ -30,7 +30,7 @@ from dvc.arrays import Float32Array, FloatArray
 from dvc.errors import ImageFileError
 from dvc.io.images.stored import Voxels
 
-CONVERT = "Convert it to NIfTI, for example with dcm2niix, and give the .nii.gz file."
+CONVERT = "Convert it to NIfTI, for example with dcm2niix, and pass the .nii.gz file."
 _SAME_DIRECTION = 1e-3
 _NEEDED = ("SeriesInstanceUID", "Rows", "Columns", "BitsAllocated")
 _PLACE = ("PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient")
@@ -110,7 +110,7 @@ def _damage_named(path: Path, problem: str = "not a readable DICOM file", remedy
     except ImageFileError:
         raise
     except Exception as error:
-        advice = remedy or "damaged or cut short. Export it again."
+        advice = remedy or "the file is damaged or incomplete. Export it again."
         raise ImageFileError(f"{path}: {problem} ({type(error).__name__}): {advice}") from None
     finally:
         logger.disabled = before
@@ -130,15 +130,15 @@ def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
         enhanced = "PerFrameFunctionalGroupsSequence" in header or "Enhanced" in stored.name
         kinds = [str(k) for k in _several(header.get("ImageType"))]
         if not enhanced and ("MOSAIC" in kinds or int(header.get("NumberOfFrames") or 1) > 1):
-            problem = "a mosaic, or a multi-frame DICOM file that does not say where its frames lie"
-            raise ImageFileError(f"{path}: {problem}; it is not read. {CONVERT}")
+            problem = "mosaics, and multi-frame DICOM files without the positions of their frames, are not supported"
+            raise ImageFileError(f"{path}: {problem}. {CONVERT}")
         needed = _NEEDED if enhanced else (*_NEEDED, *_PLACE)
         _refuse_missing(path, [name for name in needed if header.get(name) is None])
         colour = str(header.get("PhotometricInterpretation", ""))
         if not colour.startswith("MONOCHROME") or int(header.get("SamplesPerPixel", 1)) != 1:
-            raise ImageFileError(f"{path}: a DICOM image in colour; grey values (MONOCHROME) are needed.")
+            raise ImageFileError(f"{path}: the DICOM image is in colour; grey values (MONOCHROME) are needed.")
         if enhanced and stored.keyword not in _ENHANCED:
-            problem = "a multi-frame DICOM file of a kind that is not read; enhanced MR and CT images are"
+            problem = "of multi-frame DICOM files, only enhanced MR and CT images are supported"
             raise ImageFileError(f"{path}: {problem}. {CONVERT}")
         uid, total = header.get("ConcatenationUID"), header.get("InConcatenationTotalNumber")
         frames = _enhanced_frames(path, header) if enhanced else [_classic_frame(path, header)]
@@ -147,8 +147,10 @@ def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
 
 def _refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
     if missing:
-        problem = f"a DICOM image without {', '.join(missing)}{where}"
-        raise ImageFileError(f"{path}: {problem}: damaged, or not a slice with a place in space. Export it again.")
+        problem = f"the DICOM header lacks {', '.join(missing)}{where}"
+        raise ImageFileError(
+            f"{path}: {problem}; it is damaged, or the image has no position in space. Export it again."
+        )
 
 
 def _several(value: Any) -> list[Any]:
@@ -170,9 +172,9 @@ def _build_frame(path: Path, header: Any, number: int | None, own: dict[str, Any
     slope, intercept = (float(usual if own[name] is None else own[name]) for name, usual in _SCALING.items())
     which = "" if number is None else f", frame {number}"
     if not np.isfinite([*axes.ravel(), *position, row_spacing, column_spacing, slope, intercept]).all():
-        raise ImageFileError(f"{path}{which}: the DICOM header holds values that are not finite numbers; damaged.")
+        raise ImageFileError(f"{path}{which}: the DICOM header is damaged (values that are not finite).")
     if abs(axes[0] @ axes[1]) > _SAME_DIRECTION or np.abs(np.linalg.norm(axes, axis=1) - 1).max() > _SAME_DIRECTION:
-        raise ImageFileError(f"{path}{which}: rows and columns are not perpendicular unit vectors; damaged.")
+        raise ImageFileError(f"{path}{which}: the header is damaged (row and column directions not perpendicular).")
     columns, rows = int(header.Columns), int(header.Rows)
     if min(row_spacing, column_spacing) <= 0 or min(columns, rows) < 1:
         voxels = f"{columns} x {rows} voxels of {column_spacing:g} x {row_spacing:g} mm"
@@ -196,8 +198,8 @@ def _enhanced_frames(path: Path, header: Any) -> list[Frame]:
     count = int(header.get("NumberOfFrames") or 0)
     if count < 1 or len(each) != count:
         raise ImageFileError(
-            f"{path}: the header claims {count} frames and describes {len(each)} (functional groups): damaged, cut "
-            "short, or stripped by an anonymizer. Export it again."
+            f"{path}: the header claims {count} frames, but describes {len(each)} (functional groups). The file is "
+            "damaged, incomplete, or was stripped by an anonymizer. Export it again."
         )
     shared = (list(header.get("SharedFunctionalGroupsSequence") or []) or [{}])[0]
     indices = header.get("DimensionIndexSequence") or []
@@ -268,9 +270,9 @@ def _stored(path: Path, numbers: list[int], shape: tuple[int, int]) -> Iterator[
         header = pydicom.dcmread(path, specific_tags=[*_OF_PIXELS, *_OF_ALL])
         data = header.get("PixelData")
     if data is None:
-        raise ImageFileError(f"{path}: a DICOM file without pixels: damaged or cut short. Export it again.")
-    unusual = f"damaged or cut short, or an unusual compression. {CONVERT}"
-    with _damage_named(path, "its pixels cannot be decoded", unusual):
+        raise ImageFileError(f"{path}: the DICOM file has no pixels; it is damaged or incomplete. Export it again.")
+    unusual = f"the file is damaged or incomplete, or its compression is not supported. {CONVERT}"
+    with _damage_named(path, "the pixels cannot be decoded", unusual):
         syntax = header.file_meta.get("TransferSyntaxUID")
         packed = syntax is not None and syntax.is_encapsulated
         count = int(header.get("NumberOfFrames") or 1)
@@ -278,8 +280,8 @@ def _stored(path: Path, numbers: list[int], shape: tuple[int, int]) -> Iterator[
         if not packed and len(data) < needed:
             frames = f"{count} frames of " if count > 1 else ""
             raise ImageFileError(
-                f"{path}: the file is cut short: {frames}{shape[1]} x {shape[0]} voxels need {needed} bytes, it holds "
-                f"{len(data)}. Copy or export it again."
+                f"{path}: the file is incomplete: {frames}{shape[1]} x {shape[0]} voxels need {needed} bytes, but it "
+                f"has {len(data)}. Copy or export it again."
             )
         if packed and syntax != pydicom.uid.RLELossless:
             yield from _decoded_by_itk(path, header, numbers, count)
@@ -300,8 +302,8 @@ def _decoded_by_itk(path: Path, header: Any, numbers: list[int], count: int) -> 
     offsets = (tables[0], tables[1]) if tables[0] and tables[1] else None
     packed = list(generate_frames(header.PixelData, number_of_frames=count, extended_offsets=offsets))
     if len(packed) != count:
-        claim = f"the header claims {count} frames, the file holds {len(packed)} compressed ones"
-        raise ImageFileError(f"{path}: {claim}: damaged or cut short. Copy or export it again.")
+        claim = f"the header claims {count} frames, but the file has {len(packed)}"
+        raise ImageFileError(f"{path}: {claim}; it is damaged or incomplete. Copy or export it again.")
     bare = Dataset()
     for name in _OF_PIXELS:
         if name in header:
@@ -318,5 +320,5 @@ def _decoded_by_itk(path: Path, header: Any, numbers: list[int], count: int) -> 
             pydicom.dcmwrite(one, bare, enforce_file_format=True)
             values = sitk.GetArrayFromImage(sitk.ReadImage(str(one)))
             if values.shape != (1, int(header.Rows), int(header.Columns)):
-                raise ImageFileError(f"{path}: its pixels have another size than the header says; damaged.")
+                raise ImageFileError(f"{path}: the file is damaged (pixels and header differ in image size).")
             yield values[0]

@@ -59,8 +59,8 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
         names = _segment_names(place)
         listed = [f"{v}" + (f" ({names[v]})" if v in names else "") + f": {n} voxels" for v, n in counts.items()]
         raise InputError(
-            f"{place}: a mask holds zeros and one other value; this file holds {len(counts)}: {_shortened(listed)}. "
-            "It is a label map: name the region that you mean (--bone-label), or save that region as a mask."
+            f"{place}: a mask must have zeros and one other value, but this file has {len(counts)}: "
+            f"{_shortened(listed)}. It is a label map: use --labels and --bone-label, or save one region as a mask."
         )
     mask = Mask(own, labels != 0)
     return mask if grid is None else fit_mask(mask, grid, f"{place}")
@@ -94,7 +94,7 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
     if nameless:
         source = f" in {names}" if isinstance(names, str | PathLike) else ""
         lack = f"labels without a name{source}: {_shortened(nameless)}"
-        raise InputError(f"{place}: {lack}; names are given for {_shortened(sorted(known))}. Add the missing ones.")
+        raise InputError(f"{place}: {lack}. Names are given for {_shortened(sorted(known))}; add the missing ones.")
     return LabelMap(grid, labels, {v: known[v] for v in present})
 
 
@@ -108,20 +108,20 @@ def read_names(path: StrPath) -> dict[int, str]:
     try:
         text = place.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{place}: the names of labels cannot be read ({type(error).__name__}).") from error
+        raise InputError(f"{place}: the table of label names cannot be read ({type(error).__name__}).") from error
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("#")]
     is_csv = place.suffix.lower() == ".csv"
     rows = _csv_names(lines) if is_csv else [_table_name(line) for line in lines]
     if not rows or None in rows:
         wrong = "" if is_csv or not rows else f" (line: {lines[rows.index(None)][:60]!r})"
         raise InputError(
-            f"{place}: not a table of labels and names{wrong}. What is read: CSV with a header line 'label,name', "
+            f"{place}: not a table of labels and names{wrong}. Supported: CSV with a header line 'label,name', "
             "ITK-SNAP label descriptions, Slicer colour tables."
         )
     names: dict[int, str] = {}
     for value, name in filter(None, rows):
         if value in names:
-            raise InputError(f"{place}: label {value} is named twice: '{names[value]}' and '{name}'.")
+            raise InputError(f"{place}: label {value} has two names, '{names[value]}' and '{name}'.")
         if value != 0:
             names[value] = name
     return names
@@ -168,31 +168,31 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
         indices = np.stack(np.unravel_index(filled[start : start + _POINTS_AT_ONCE], own.shape), axis=-1)
         inside += int(np.count_nonzero(grid.contains(own.points_at(indices.astype(np.float64)))))
     if total == 0:
-        raise GeometryError(f"{what}: it holds no voxel other than 0.")
+        raise GeometryError(f"{what}: all voxels are 0.")
     share = inside / total
     boxes = f"Its grid: {own}. The image's grid: {grid}."
     if share < _NEEDED_OVERLAP:
         raise GeometryError(
-            f"{what}: {share:.0%} of its volume lies in the image; at least {_NEEDED_OVERLAP:.0%} is "
-            f"needed. {boxes} It was drawn on another image, or its header lost its place in space."
+            f"{what}: only {share:.0%} of its volume is inside the image; at least {_NEEDED_OVERLAP:.0%} is "
+            f"needed. {boxes} It was drawn on another image, or its header has a wrong position."
         )
     mirrored = _mirrored_axes(own, grid)
     if mirrored:
         raise GeometryError(
-            f"{what}: its grid is the image's with the signs of {mirrored} reversed: a header in RAS was "
-            f"taken for LPS, or the reverse. {boxes} Export it again from the image that it was drawn on."
+            f"{what}: its grid is that of the image with the signs of {mirrored} reversed, so RAS and LPS were "
+            f"confused. {boxes} Export it again from the image on which it was drawn."
         )
     fitted: Any = _nearest(own, values, grid)
     left = np.count_nonzero(fitted) * grid.voxel_volume_mm3
     if left == 0:
-        raise GeometryError(f"{what}: nothing of it is left on the image's grid. {boxes}")
+        raise GeometryError(f"{what}: no voxel is left after resampling to the grid of the image. {boxes}")
     before = total * own.voxel_volume_mm3
-    change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL, {100 * share:.0f} % of it lies in the image"
+    change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL; {100 * share:.0f} % of it is inside the image"
     _log.warning("%s: on another grid than the image; resampled by nearest neighbour (%s). %s", what, change, boxes)
     if isinstance(mask_or_labels, LabelMap):
         lost = sorted(set(_counts(values)) - set(_counts(fitted)))
         if lost:
-            _log.warning("%s: regions lost by it: %s", what, [mask_or_labels.names[v] for v in lost])
+            _log.warning("%s: regions lost by resampling: %s", what, [mask_or_labels.names[v] for v in lost])
     return replace(mask_or_labels, grid=grid, **{field: fitted})
 
 
@@ -229,23 +229,24 @@ def _nearest(own: Grid, values: npt.NDArray[Any], grid: Grid) -> npt.NDArray[Any
 def _integers(path: Path, what: str) -> tuple[Grid, IntArray, dict[int, int]]:
     """Grid, labels and their counts of a file whose values must be whole numbers, in whatever type they are stored."""
     if path.is_dir():
-        raise InputError(f"{path}: masks and labels are read from one file, not from a folder (DICOM). Convert it.")
+        problem = "a mask or label map must be one file, not a folder of DICOM files"
+        raise InputError(f"{path}: {problem}. Convert it, for example to NIfTI.")
     grid, voxels = read_voxels(path)
-    rule = f"{path}: masks and labels hold whole numbers below {_LARGEST_LABEL};"
+    rule = f"{path}: masks and labels must be whole numbers below {_LARGEST_LABEL};"
     if voxels.dtype.kind == "f":
         whole = np.isfinite(voxels) & (np.abs(voxels) < _LARGEST_LABEL)
         whole &= np.rint(np.where(whole, voxels, 0)) == voxels
         if not whole.all():
             odd = [f"{v:g}" for v in np.unique(voxels[~whole])[:_SHOWN]]
             raise InputError(
-                f"{rule} {int((~whole).sum())} voxels do not, such as {_shortened(odd)}. Threshold a probability map "
-                "first, and resample labels with nearest neighbour only."
+                f"{rule} {int((~whole).sum())} voxels are not, such as {_shortened(odd)}. Threshold probability maps "
+                "first, and resample labels only by nearest neighbour."
             )
     elif int(voxels.max()) >= _LARGEST_LABEL:
-        raise InputError(f"{rule} found {int(voxels.max())}. Number the labels anew.")
+        raise InputError(f"{rule} the highest is {int(voxels.max())}. Renumber the labels.")
     labels = np.ascontiguousarray(voxels, dtype=np.int64)
     if not (counts := _counts(labels)):
-        raise InputError(f"{path}: the {what} is empty: all of its {labels.size} voxels are 0.")
+        raise InputError(f"{path}: the {what} is empty; all {labels.size} voxels are 0.")
     return grid, labels, counts
 
 

@@ -35,7 +35,7 @@ def read_nifti_header(
     header, compressed = _header(path)
     sizes = [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
     if vectors and (sizes[3:5] != [1, components] or any(n not in (0, 1) for n in sizes[5:])):
-        raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; (ni, nj, nk, 1, {components}) is needed.")
+        raise ImageFileError(f"{path}: the NIfTI has shape {tuple(sizes)}; (ni, nj, nk, 1, {components}) is needed.")
     shape, count = _sizes(path, sizes[:3] if vectors else sizes)
     layout = (*shape, components) if vectors else shape
     # Size and count come first: a header that is wrong there is not worth a look at its geometry.
@@ -70,7 +70,9 @@ def _header(path: Path) -> tuple[Any, bool]:
     for kind, size, magic in ((nibabel.Nifti1Header, 348, slice(344, 348)), (nibabel.Nifti2Header, 540, slice(4, 8))):
         written = start[magic] if len(start) >= size else b""
         if written[:3] in (b"ni1", b"ni2"):
-            raise ImageFileError(f"{path}: header of a pair of files (.hdr with .img). Convert it to one .nii.gz file.")
+            raise ImageFileError(
+                f"{path}: pairs of .hdr and .img files are not supported. Convert to one .nii.gz file."
+            )
         if written[:3] in (b"n+1", b"n+2"):
             # The library's own check is left out: it repairs some faults and prints others.
             header = kind(start[:size], check=False)
@@ -79,8 +81,8 @@ def _header(path: Path) -> tuple[Any, bool]:
                 if not low <= value <= high:
                     raise ImageFileError(f"{path}: the NIfTI header is damaged ({field} = {value:g}). Export it again.")
             return header, compressed
-    problem = f"no NIfTI header at its start ({len(start)} bytes read)"
-    raise ImageFileError(f"{path}: not a NIfTI file: {problem}. Check the file's name, or export it again.")
+    problem = f"no NIfTI header in its first {len(start)} bytes"
+    raise ImageFileError(f"{path}: not a NIfTI file ({problem}). Check the file name, or export it again.")
 
 
 def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
@@ -92,10 +94,10 @@ def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
     if min(sizes) < 1:
         raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
     if len(sizes) < 3:
-        raise ImageFileError(f"{path}: a {len(sizes)}D image of {sizes} voxels; a 3D image is needed.")
+        raise ImageFileError(f"{path}: the image is {len(sizes)}D, {sizes} voxels; a 3D image is needed.")
     if len(sizes) > 4:
         raise ImageFileError(
-            f"{path}: a {len(sizes)}D file, {sizes} (vectors or tensors); a 3D scalar image is needed."
+            f"{path}: the file is {len(sizes)}D, {sizes} (vectors or tensors); a 3D scalar image is needed."
         )
     return (sizes[0], sizes[1], sizes[2]), sizes[3] if len(sizes) == 4 else 1
 
@@ -107,8 +109,8 @@ def _number_type(path: Path, header: Any) -> np.dtype[Any]:
     except KeyError:
         raise ImageFileError(f"{path}: unknown NIfTI data type {code}; the header is damaged.") from None
     if dtype.kind not in "iuf" or dtype.itemsize > 8 or dtype.itemsize < 1:
-        problem = f"the voxels are not plain numbers (NIfTI data type {code}: colour or complex)"
-        raise ImageFileError(f"{path}: {problem}, which are not read. Save the magnitude image.")
+        problem = f"colour and complex images are not supported (NIfTI data type {code})"
+        raise ImageFileError(f"{path}: {problem}. Save the magnitude image.")
     return dtype
 
 
@@ -118,7 +120,7 @@ def _unit(path: Path, header: Any) -> tuple[str, float]:
     if code not in _UNITS:
         raise ImageFileError(f"{path}: unknown unit of length (xyzt_units code {code}); set it to mm (2).")
     if code == 0:
-        _log.warning("%s: the header gives no unit of length; taken as mm", path)
+        _log.warning("%s: the header gives no unit of length; mm is assumed", path)
     return _UNITS[code]
 
 
@@ -128,12 +130,12 @@ def _ras_affine(path: Path, header: Any, shape: tuple[int, int, int]) -> FloatAr
     sforms = [full] if int(header["sform_code"]) > 0 else []
     if not qforms and not sforms:
         raise ImageFileError(
-            f"{path}: the header does not say how the image lies in space (qform_code and sform_code are 0), and "
-            "programs guess differently. Export it again with its orientation, or copy its source's header."
+            f"{path}: the header has no orientation (qform_code and sform_code are 0), and programs would assume "
+            "different ones. Export it again with its orientation, or copy the header of its source."
         )
     for name, affines in (("qform", qforms), ("sform", sforms)):
         if not np.isfinite(affines).all():
-            raise ImageFileError(f"{path}: the {name} holds values that are not finite; the header is damaged.")
+            raise ImageFileError(f"{path}: the {name} has values that are not finite; the header is damaged.")
     if qforms and sforms:
         _refuse_disagreement(path, qforms, sforms[0], shape)
     return (sforms or qforms)[0]  # a full matrix holds its digits better than a quaternion
@@ -167,7 +169,7 @@ def _refuse_disagreement(path: Path, qforms: list[FloatArray], sform: FloatArray
     voxel = float(np.linalg.norm(sform[:3, :3], axis=0).min())
     if not apart <= _AGREEMENT_VOXELS * voxel:
         raise ImageFileError(
-            f"{path}: qform and sform place the image's corners up to {apart:.3g} (header units) apart, "
-            f"which is {apart / voxel if voxel > 0 else np.inf:.3g} voxels; programs differ in which of the "
-            "two they use. Set the wrong one's code to 0, or export the image again with one orientation."
+            f"{path}: qform and sform differ: they place the image corners up to {apart:.3g} (header units) apart, "
+            f"{apart / voxel if voxel > 0 else np.inf:.3g} voxels. Programs differ in which of the two they use. "
+            "Set the code of the wrong one to 0, or export the image again with one orientation."
         )

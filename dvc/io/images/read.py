@@ -30,17 +30,17 @@ def read_image(
     path: StrPath, *, allow_missing: bool = False, series: str | None = None, volume: int | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Image:  # fmt: skip
-    """Read a 3D image, whatever its format, into LPS mm: voxels in the order of the file, slope and intercept applied.
+    """Read a 3D image of any supported format into LPS mm; voxel order as in the file, slope and intercept applied.
 
     Parameters
     ----------
     path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, enhanced DICOM) or folder of a DICOM series
     allow_missing : bool
-        Take voxels that are NaN or infinite as missing (NaN) instead of refusing the image.
+        Treat NaN and infinite voxels as missing (NaN), instead of refusing the image.
     series : str, optional
-        Which DICOM series, echo, stack or the like, where there are several, as the refusal lists them.
+        DICOM series, echo, stack or similar, if there are several; the error message lists their names.
     volume : int, optional
-        Which volume of a 4D file, from 0.
+        Number of the volume in a 4D file, from 0.
     max_bytes : int
         Largest image that is read, counted in single precision.
 
@@ -56,8 +56,8 @@ def read_image(
     grid, voxels = read_voxels(path, series=series, volume=volume, max_bytes=max_bytes)
     if min(grid.shape) < _MIN_SLICES:
         raise ImageFileError(
-            f"{path}: an image of {' x '.join(map(str, grid.shape))} voxels; a volume needs at least "
-            f"{_MIN_SLICES} slices along each axis, since strain is a matter of three dimensions."
+            f"{path}: the image has {' x '.join(map(str, grid.shape))} voxels. Strain in three dimensions needs at "
+            f"least {_MIN_SLICES} slices along each axis."
         )
     with np.errstate(over="ignore"):  # beyond single precision: infinite, and refused below
         values = np.ascontiguousarray(voxels, dtype=np.float32)
@@ -69,12 +69,12 @@ def read_image(
         first = tuple(map(int, np.unravel_index(int(np.argmin(finite)), values.shape)))
         problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
         if not allow_missing:
-            raise InputError(f"{path}: {problem}. Repair the image, or have those voxels left out (allow_missing).")
-        _log.warning("%s: %s; taken as missing", path, problem)
+            raise InputError(f"{path}: {problem}. Repair the image, or leave these voxels out (allow_missing).")
+        _log.warning("%s: %s; treated as missing", path, problem)
         values = np.where(finite, values, np.float32(np.nan))
     low = np.nanmin(values)
     if low == np.nanmax(values):
-        raise ImageFileError(f"{path}: a constant image (every voxel is {float(low):g}); there is nothing to follow.")
+        raise ImageFileError(f"{path}: the image is constant (all voxels are {float(low):g}); it cannot be registered.")
     return Image(grid, values)
 
 
@@ -88,10 +88,10 @@ def read_voxels(
         raise InputError(f"{place}: no such file or folder. Check the path.")
     if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):
         if volume is not None:
-            raise InputError(f"{place}: volume={volume} is for 4D files; DICOM is chosen from by series.")
+            raise InputError(f"{place}: volume={volume} is for 4D files; for DICOM use series.")
         return read_dicom(place, series=series, max_bytes=max_bytes)
     if series is not None:
-        raise InputError(f"{place}: series='{series}' is for DICOM folders and files; this is neither.")
+        raise InputError(f"{place}: series='{series}' is only for DICOM files and folders; this is neither.")
     stored = read_header(place, volume=volume, max_bytes=max_bytes)
     if stored.unit != "mm":
         _log.warning("%s: lengths converted from %s to mm", place, stored.unit)
@@ -105,7 +105,7 @@ def read_header(
     suffix = _known_suffix(path.name)
     if suffix is None:
         known = f"{', '.join(_FORMATS)}, enhanced DICOM files and folders of DICOM files"
-        raise ImageFileError(f"{path}: images of this kind are not read. What is read: {known}.")
+        raise ImageFileError(f"{path}: this image format is not supported. Supported: {known}.")
     return _FORMATS[suffix][1](path, volume, max_bytes, vectors)
 
 

@@ -88,14 +88,14 @@ class StoredVolume:
             raise self._cut_short(expected, available)
         if available > expected + _TRAILING:
             raise ImageFileError(
-                f"{self.path}: the header describes {expected} bytes of voxels, the file holds {available}: "
-                "header and voxels do not belong together. Export the image again."
+                f"{self.path}: the header describes {expected} bytes of voxels, but the file has {available}. "
+                "Header and voxels do not match. Export the image again."
             )
         return raw
 
     def _cut_short(self, expected: int, available: int, coded: str = "") -> ImageFileError:
         return ImageFileError(
-            f"{self.path}: the file is cut short: the header needs {expected} bytes of voxels, the file holds "
+            f"{self.path}: the file is incomplete: the header needs {expected} bytes of voxels, but the file has "
             f"{available}{coded} bytes. Copy or export it again."
         )
 
@@ -125,7 +125,7 @@ def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
                 continue
             pending = decoder.unconsumed_tail or file.read(_BLOCK)
             if not pending and not block:
-                problem = "the file is cut short: its compressed voxels have no end"
+                problem = "the file is incomplete: its compressed voxels have no end"
                 raise ImageFileError(f"{path}: {problem}. Copy or export it again.")
 
 
@@ -156,8 +156,8 @@ def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> N
     if estimate > max_bytes:
         raise ImageFileError(
             f"{path}: the header claims {' x '.join(map(str, sizes))} voxels, about {estimate / 2**30:,.1f} "
-            f"GiB in single precision; the limit is {max_bytes / 2**30:,.1f} GiB. Either the header is "
-            "damaged, or the image must be cropped or resampled first."
+            f"GiB in single precision; the limit is {max_bytes / 2**30:,.1f} GiB. Crop or resample the image first, or "
+            "export it again if the header is damaged."
         )
 
 
@@ -167,9 +167,9 @@ def pick_volume(path: Path, count: int, volume: int | None) -> int:
         if count == 1:
             return 0
         raise ImageFileError(
-            f"{path}: the file holds {count} volumes; one is needed. Take it out into a file of its own: in Python, "
-            f'dvc.write_image("one.nii.gz", dvc.read_image("{path}", volume=N)) with N from 0 to {count - 1}.'
+            f"{path}: the file has {count} volumes, but one is needed. Write it to a file of its own in Python: "
+            f'dvc.write_image("one.nii.gz", dvc.read_image("{path}", volume=N)), with N from 0 to {count - 1}.'
         )
     if not 0 <= volume < count:
-        raise ImageFileError(f"{path}: volume={volume} was asked for; the file holds volumes 0 to {count - 1}.")
+        raise ImageFileError(f"{path}: volume={volume} does not exist; the file has volumes 0 to {count - 1}.")
     return volume

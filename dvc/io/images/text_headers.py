@@ -48,10 +48,10 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     with path.open("rb") as file:
         start = file.read(_HEADER_LIMIT)
     if not re.match(rb"NRRD000\d\r?\n", start):
-        raise ImageFileError(f"{path}: not an NRRD file (no NRRD magic at its start). Export it again.")
+        raise ImageFileError(f"{path}: not an NRRD file (it does not start with NRRD). Export it again.")
     end = re.search(rb"\r?\n\r?\n", start)
     if end is None and path.stat().st_size >= _HEADER_LIMIT:
-        raise ImageFileError(f"{path}: the NRRD header does not end; the file is damaged.")
+        raise ImageFileError(f"{path}: the NRRD header has no end; the file is damaged.")
     text = start[: end.start() if end else len(start)].decode("utf-8", errors="replace")
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}
@@ -65,7 +65,7 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
             name, value = line.split(":", 1)
             fields[name.strip().lower()] = value.strip()
         else:
-            raise ImageFileError(f"{path}: a line of the NRRD header is no field: '{line[:60]}'; it is damaged.")
+            raise ImageFileError(f"{path}: the NRRD header is damaged; this line is not a field: '{line[:60]}'.")
     return fields, pairs, end.end() if end else len(start)
 
 
@@ -74,7 +74,7 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     fields, _, end = nrrd_fields(path)
     sizes = _whole_numbers(path, fields, "sizes")
     if _whole_numbers(path, fields, "dimension") != [len(sizes)]:
-        raise ImageFileError(f"{path}: {len(sizes)} sizes in {fields['dimension']} dimensions; the header is damaged.")
+        raise ImageFileError(f"{path}: the header is damaged ({len(sizes)} sizes, {fields['dimension']} dimensions).")
     if len(sizes) < 3:
         raise ImageFileError(f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed.")
     steps = _steps(path, fields)
@@ -88,22 +88,22 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     refuse_if_too_large(path, tuple(sizes), max_bytes)
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
-        raise ImageFileError(f"{path}: NRRD encoding '{encoding}' is not read; save it as raw or gzip.")
+        raise ImageFileError(f"{path}: NRRD encoding '{encoding}' is not supported; save it as raw or gzip.")
     detached = fields.get("data file", fields.get("datafile"))
     data, start = (path, end) if detached is None else (_detached_file(path, detached), 0)
     if any(fields.get(name, "0") != "0" for name in ("line skip", "lineskip", "byte skip", "byteskip")):
-        raise ImageFileError(f"{path}: NRRD files that skip lines or bytes are not read; save it again, attached.")
+        raise ImageFileError(f"{path}: NRRD files that skip lines or bytes are not supported; save it as one file.")
     kind = " ".join(fields.get("type", "").lower().split())
     if kind not in _NRRD_TYPES:
-        raise ImageFileError(f"{path}: NRRD type '{kind}' is not a number that is read.")
+        raise ImageFileError(f"{path}: NRRD type '{kind}' is not supported; save it as numbers.")
     order = fields.get("endian", "little").lower()
     if "endian" not in fields and _NRRD_TYPES[kind][1] != "1":
         raise ImageFileError(f"{path}: the NRRD header does not give the byte order (endian); save it again.")
     if order not in ("little", "big"):
-        raise ImageFileError(f"{path}: the byte order (endian) is '{order}', neither little nor big: damaged.")
+        raise ImageFileError(f"{path}: the header is damaged (endian is '{order}', neither little nor big).")
     units = fields.get("space units", "")
     if not re.fullmatch(r'("[^"]*"\s*)*', units):
-        raise ImageFileError(f"{path}: the header's 'space units' are no words in quotes: '{units[:60]}'; damaged.")
+        raise ImageFileError(f"{path}: the header is damaged ('space units' are not quoted words: '{units[:60]}').")
     unit = _unit_of_length(path, {unit.strip().lower() for unit in re.findall(r'"([^"]*)"', units)})
     to_lps_mm = np.array(_TO_LPS[fields["space"].lower()]) * _MM_PER_UNIT[unit]
     columns = np.stack([*axes.values()], axis=1) * to_lps_mm[:, None]
@@ -125,12 +125,12 @@ def _fourth_axis(
         if count != 3:
             raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
         if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
-            raise ImageFileError(f"{path}: the three values of a voxel are of kind {kind}; a vector is needed.")
+            raise ImageFileError(f"{path}: the three values per voxel are of kind {kind}; vectors are needed.")
         return None, other
     if path.name.lower().endswith(".seg.nrrd") and count > 1:
         raise ImageFileError(
-            f"{path}: a segmentation of {count} layers, in which segments overlap; a label map has one "
-            "label per voxel. In Slicer, export the segments to a label map, or remove the overlap."
+            f"{path}: the segmentation has {count} layers, so segments overlap. A label map has one label per "
+            "voxel. In Slicer, export the segments to a label map, or remove the overlap."
         )
     if count > 1 and not any(word in kind for word in ("list", "domain", "time", "?", "none")) and kind:
         raise ImageFileError(f"{path}: each voxel holds {count} values (kind {kind}); a scalar image is needed.")
@@ -143,11 +143,11 @@ def _steps(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
     written, space = fields.get("space directions"), fields.get("space", "").lower()
     if written is None or space not in _TO_LPS:
         raise ImageFileError(
-            f"{path}: the NRRD header does not say how the image lies in the body (space: '{space or 'none'}', space "
-            f"directions: {'given' if written else 'none'}); the spaces that are read are {sorted(_TO_LPS)}."
+            f"{path}: the NRRD header has no supported orientation (space: '{space or 'none'}', space directions: "
+            f"{'given' if written else 'none'}). Supported spaces: {sorted(_TO_LPS)}."
         )
     if not re.fullmatch(r"((none|\([^()]*\))\s*)+", written):
-        raise ImageFileError(f"{path}: the header's 'space directions' are no vectors: '{written[:60]}'; damaged.")
+        raise ImageFileError(f"{path}: the header is damaged ('space directions' are not vectors: '{written[:60]}').")
     items = re.findall(r"none|\([^()]*\)", written)
     return [None if item == "none" else _vector(path, item, "space directions") for item in items]
 
@@ -176,9 +176,9 @@ def read_meta_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
         raise ImageFileError(f"{path}: each voxel holds {channels} values; a scalar image is needed.")
     kind = fields.get("elementtype", "")
     if kind not in _META_TYPES or not _truth(path, fields, "binarydata", True):
-        raise ImageFileError(f"{path}: voxels of type '{kind}', or written as text, are not read; save it as binary.")
+        raise ImageFileError(f"{path}: voxels of type '{kind}', or as text, are not supported; save it as binary.")
     if _numbers_in(path, fields.get("headersize", "0"), "HeaderSize", 1) != [0.0]:
-        raise ImageFileError(f"{path}: MetaImage files with a HeaderSize are not read; save it again as .mha.")
+        raise ImageFileError(f"{path}: MetaImage files with a HeaderSize are not supported; save it again as .mha.")
     named = fields["elementdatafile"]
     data, start = (path, end) if named == "LOCAL" else (_detached_file(path, named), 0)
     if _META_TYPES[kind][1] != "1" and not set(_BYTE_ORDER) & set(fields):
@@ -205,7 +205,8 @@ def _meta_fields(path: Path) -> tuple[dict[str, str], int]:
     lines = [line for line in start[: last.end()].decode("utf-8", errors="replace").splitlines() if line.strip()]
     damaged = [line for line in lines if "=" not in line]
     if damaged:
-        raise ImageFileError(f"{path}: a line of the MetaImage header is no field: '{damaged[0][:60]}'; it is damaged.")
+        line = f"this line is not a field: '{damaged[0][:60]}'"
+        raise ImageFileError(f"{path}: the MetaImage header is damaged; {line}.")
     pairs = (line.split("=", 1) for line in lines)
     return {name.strip().lower(): value.strip() for name, value in pairs}, last.end()
 
@@ -214,26 +215,25 @@ def _needed(path: Path, fields: Mapping[str, str], names: tuple[str, ...], count
     """Numbers of a field for which the format has a default, as which a damaged line would be read."""
     written = next((fields[name.lower()] for name in names if name.lower() in fields), None)
     if written is None:
-        where = "the MetaImage header does not say how the image lies in the body"
-        raise ImageFileError(f"{path}: {where} (no {names[0]}). Export it again.")
+        raise ImageFileError(f"{path}: the MetaImage header has no orientation (no {names[0]}). Export it again.")
     return np.array(_numbers_in(path, written, names[0], count))
 
 
 def _truth(path: Path, fields: Mapping[str, str], name: str, default: bool) -> bool:
     word = fields.get(name, str(default)).lower()
     if word not in ("true", "t", "1", "false", "f", "0"):
-        raise ImageFileError(f"{path}: the header's '{name}' is '{word}', neither True nor False: damaged.")
+        raise ImageFileError(f"{path}: the header is damaged ('{name}' is '{word}', neither True nor False).")
     return word in ("true", "t", "1")
 
 
 def _detached_file(path: Path, name: str) -> Path:
     """The file beside a header that holds its voxels."""
     if name.startswith("LIST") or "%" in name:
-        raise ImageFileError(f"{path}: voxels spread over several files are not read; save it as one file.")
+        raise ImageFileError(f"{path}: voxels in several files are not supported; save it as one file.")
     with suppress(OSError):  # no name that a file can have
         if (path.parent / name).is_file():
             return path.parent / name
-    raise ImageFileError(f"{path}: the file of its voxels, '{name}', is not there; keep the two together.")
+    raise ImageFileError(f"{path}: the file with the voxels, '{name}', is missing; keep both in one folder.")
 
 
 def _numbers_in(path: Path, text: str, field: str, count: int | None = None) -> list[float]:
@@ -249,7 +249,7 @@ def _numbers_in(path: Path, text: str, field: str, count: int | None = None) -> 
 def _whole_numbers(path: Path, fields: Mapping[str, str], field: str) -> list[int]:
     numbers = _numbers_in(path, fields.get(field, ""), field)
     if not all(n.is_integer() and abs(n) < _LARGEST_SIZE for n in numbers):
-        raise ImageFileError(f"{path}: the header's '{field}' must be whole numbers; got {numbers}: damaged.")
+        raise ImageFileError(f"{path}: the header is damaged ('{field}' must be whole numbers; got {numbers}).")
     return [int(n) for n in numbers]
 
 
@@ -257,5 +257,5 @@ def _unit_of_length(path: Path, units: set[str]) -> str:
     """The one unit of length; mm where none is given."""
     known = {unit or "mm" for unit in units} or {"mm"}
     if len(known) != 1 or not known <= set(_MM_PER_UNIT):
-        raise ImageFileError(f"{path}: lengths in {sorted(units)}; the units that are read are mm, cm, m and um.")
+        raise ImageFileError(f"{path}: lengths are in {sorted(units)}; supported units are mm, cm, m and um.")
     return known.pop()

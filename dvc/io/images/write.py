@@ -103,7 +103,7 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
     place, largest = Path(path), int(labels.labels.max())
     dtype = np.min_scalar_type(largest) if largest < 2**16 else np.int32
     if largest >= 2**31:
-        raise OutputError(f"{place}: label {largest} is too large for the file format; number the labels anew.")
+        raise OutputError(f"{place}: label {largest} is too large for the file format; renumber the labels.")
     _write(place, labels.grid, labels.labels.astype(dtype))
     write_csv(_beside(place, ".csv"), ("label", "name"), sorted(labels.names.items()))
 
@@ -153,7 +153,7 @@ def write_vectors(
     if array.dtype.kind not in "biuf":
         raise InputError(f"values must be real numbers; got {array.dtype}.")
     if frame not in ("LPS", "invariant"):
-        raise InputError(f"{place}: frame '{frame}'; components are written in LPS, or are invariant.")
+        raise InputError(f"{place}: the frame of the components must be LPS or invariant; got '{frame}'.")
     vector = frame == "LPS" and len(components) == 3
     _write(place, grid, array.astype(np.float32, copy=False), vector=vector)
     declared: dict[str, object] = {"file": place.name, "meaning": meaning, "components": [*components], "frame": frame}
@@ -169,8 +169,8 @@ def refuse_overwriting_inputs(outputs: Iterable[StrPath], inputs: Iterable[StrPa
         for source in sources:
             same = there == source.resolve() or (output.exists() and source.exists() and output.samefile(source))
             if same or (source.is_dir() and source.resolve() in there.parents):
-                problem = f"this output would overwrite or lie within the input {source}"
-                raise OutputError(f"{output}: {problem}. Choose another file or folder for the outputs.")
+                problem = f"this output would overwrite the input {source}, or would be inside it"
+                raise OutputError(f"{output}: {problem}. Choose another output file or folder.")
 
 
 def _beside(path: Path, suffix: str) -> Path:
@@ -181,7 +181,7 @@ def _format(path: Path) -> str:
     for suffix in _SUFFIXES:
         if path.name.lower().endswith(suffix) and len(path.name) > len(suffix):
             return suffix
-    raise OutputError(f"{path}: files of this kind are not written; the suffixes are {', '.join(_SUFFIXES)}.")
+    raise OutputError(f"{path}: this output format is not supported; use {', '.join(_SUFFIXES)}.")
 
 
 def _write(path: Path, grid: Grid, values: npt.NDArray[Any], vector: bool = False) -> None:
@@ -214,7 +214,7 @@ def _nifti(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
     try:
         header.set_data_shape(grid.shape if values.ndim == 3 else (*grid.shape, 1, values.shape[3]))
     except Exception as error:
-        raise OutputError(f"NIfTI cannot hold {grid.shape} voxels; write .nrrd instead.") from error
+        raise OutputError(f"NIfTI does not allow {grid.shape} voxels; write .nrrd instead.") from error
     header.set_data_dtype(values.dtype)
     affine = LPS_FROM_RAS @ grid.affine
     header.set_qform(affine, code=1)

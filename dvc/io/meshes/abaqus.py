@@ -56,7 +56,7 @@ def read_abaqus(path: Path) -> RawMesh:
             elif keyword.name in {"INSTANCE", "END ASSEMBLY"}:
                 in_assembly = False
             elif keyword.name == "NODE" and in_assembly:
-                _log.info("%s: %d reference points of the assembly are left out.", where, len(keyword.rows))
+                _log.info("%s: %d reference points of the assembly are skipped.", where, len(keyword.rows))
             elif keyword.name == "NODE":
                 for row in keyword.rows:
                     mesh.add_node(int(row[0]), ([float(x or 0.0) for x in row[1:4]] + [0.0] * 3)[:3])
@@ -78,7 +78,7 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        raise ImageFileError(f"{path} cannot be read: {error.strerror}.") from error
+        raise ImageFileError(f"{path}: cannot be read ({error.strerror}).") from error
     current: _Keyword | None = None
     head, head_line = "", 0
     for number, raw in enumerate(text.splitlines(), start=1):
@@ -101,8 +101,8 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
     if current is not None:
         if head or (current.name in _READ and not text.endswith(("\n", "\r"))):
             # The format has no mark of its end, and half a number would be another node.
-            problem = f"it ends within a line, after *{current.name} in line {current.line}"
-            raise ImageFileError(f"{path} may be cut short: {problem}. If it is whole, end its last line.")
+            problem = f"it ends in the middle of a line, after *{current.name} in line {current.line}"
+            raise ImageFileError(f"{path}: the file may be incomplete: {problem}. If not, add a line break at its end.")
         yield current
 
 
@@ -113,12 +113,12 @@ def _refuse_what_lies_elsewhere(where: str, keyword: _Keyword, parts: int) -> No
     elif keyword.name == "INSTANCE" and keyword.rows:
         reason = "moves the part"
     elif keyword.name in _ELSEWHERE or (keyword.name in _READ and "INPUT" in keyword.options):
-        reason = "brings in, makes or moves nodes and elements that are not written here"
+        reason = "includes, generates or moves nodes or elements that are not in this file"
     elif keyword.name == "NODE" and keyword.options.get("SYSTEM", "R").upper() != "R":
-        reason = "gives cylindrical or spherical coordinates"
+        reason = "uses cylindrical or spherical coordinates"
     if reason is not None:
         advice = "Write the mesh as one part in global coordinates (an orphan mesh), or as VTU."
-        raise ImageFileError(f"{where} {reason}, and that is not read. {advice}")
+        raise ImageFileError(f"{where} {reason}, which is not supported. {advice}")
 
 
 def _add_elements(where: str, keyword: _Keyword, mesh: NumberedMesh) -> list[int]:
@@ -128,18 +128,18 @@ def _add_elements(where: str, keyword: _Keyword, mesh: NumberedMesh) -> list[int
     if not stems:
         if kind.startswith("C3D"):
             raise ImageFileError(
-                f"{where}: solid elements of type {kind} are not read; known are "
+                f"{where}: solid elements of type {kind} are not supported; supported are "
                 f"{', '.join(s for s in _SHAPES if s.startswith('C3D'))} and their variants (H, R, I, M ...)."
             )
-        _log.warning("%s: elements of type %s carry no tissue and are left out.", where, kind)
+        _log.warning("%s: elements of type %s carry no tissue and are skipped.", where, kind)
         return []
     shape, width = _SHAPES[max(stems, key=len)]
     # An element of many nodes goes over several lines, so rows are joined before they are cut.
     numbers = [int(x) for row in keyword.rows for x in row if x]
     if len(numbers) % (width + 1):
         raise ImageFileError(
-            f"{where}: {kind} elements need {width + 1} numbers each; the {len(numbers)} numbers here are no "
-            "multiple of that. The file may be cut short."
+            f"{where}: {kind} elements need {width + 1} numbers each, but {len(numbers)} is not a multiple of that. "
+            "The file may be incomplete."
         )
     rows = [numbers[i : i + width + 1] for i in range(0, len(numbers), width + 1)]
     for number, *nodes in rows:
@@ -169,7 +169,7 @@ class _Sets:
             except ImageFileError as error:
                 if self._kind == "ELSET":
                     raise
-                _log.warning("%s The set is left out.", error)  # nodes of an assembly: no tissue is lost with them
+                _log.warning("%s The set is skipped.", error)  # nodes of an assembly: no tissue is lost with them
         return members
 
     def _members(self, name: str, seen: tuple[str, ...] = ()) -> list[int]:

@@ -32,7 +32,7 @@ _FORMAT = re.compile(r"\((\d+)i(\d+)(?:,(\d+)e(\d+))?", re.IGNORECASE)
 def _next(lines: Iterator[str], within: str) -> str:
     for line in lines:
         return line
-    raise ValueError(f"it ends within {within}: cut short")
+    raise ValueError(f"the file ends within {within}")
 
 
 def read_ansys(path: Path) -> RawMesh:
@@ -60,12 +60,12 @@ def read_ansys(path: Path) -> RawMesh:
             elif word == "EBLOCK" and len(fields) > 2 and fields[2].upper() == "SOLID":
                 _add_elements(lines, types, mesh, materials)
             elif word == "EBLOCK":
-                _log.warning("%s: a block of contact elements is left out.", path)
+                _log.warning("%s: a block of contact elements is skipped.", path)
             elif word == "CMBLOCK":
                 of_kind = components.setdefault(fields[2][:4].upper(), {})
                 of_kind[fields[1].upper()] = _members(lines, int(fields[3]))
     if not {"NBLOCK", "EBLOCK"} <= words:
-        raise ImageFileError(f"{path} has no nodes or no elements in blocks. Write it with CDWRITE, DB, name, cdb.")
+        raise ImageFileError(f"{path}: no blocks of nodes or of elements. Write the file with CDWRITE, DB, name, cdb.")
     regions = {f"material {number}": materials[number] for number in sorted(materials)}
     return mesh.by_index(regions | components["ELEM"], components["NODE"])
 
@@ -75,7 +75,7 @@ def _format(line: str) -> list[int]:
     columns = _FORMAT.search(line)
     numbers = [int(n) for n in columns.groups() if n] if columns else []
     if not numbers or 0 in numbers:
-        raise ValueError(f"'{line.strip()}' is no format")
+        raise ValueError(f"'{line.strip()}' is not a format")
     return numbers
 
 
@@ -93,7 +93,7 @@ def _add_nodes(lines: Iterator[str], mesh: NumberedMesh) -> None:
         at = [line[start + i * wide : start + (i + 1) * wide].strip() for i in range(3)]
         cut = [text for text in at if text and len(text) < wide // 2]
         if cut:
-            raise ValueError(f"'{cut[0]}' is no coordinate")
+            raise ValueError(f"'{cut[0]}' is not a coordinate")
         mesh.add_node(int(line[:width]), [float(text or 0.0) for text in at])
 
 
@@ -108,7 +108,7 @@ def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMes
         while len(nodes) < count:
             nodes += _columns(_next(lines, "EBLOCK"), width)
         if kind not in types:
-            raise ValueError(f"element {number} has type {kind}, which no ET defines")
+            raise ValueError(f"element {number} has type {kind}, which is not defined by any ET")
         cell = _shape(types[kind], nodes[:count])
         if cell is None:
             left_out[types[kind]] += 1
@@ -116,7 +116,7 @@ def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMes
             mesh.add_element(number, *cell)
             of.setdefault(material, []).append(number)
     for kind, count in left_out.items():
-        _log.warning("%s: %d elements of type %s are left out: no solid or shell that is read.", mesh.path, count, kind)
+        _log.warning("%s: %d elements of type %s are skipped: not a supported solid or shell.", mesh.path, count, kind)
 
 
 def _members(lines: Iterator[str], count: int) -> list[int]:

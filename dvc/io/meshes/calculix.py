@@ -25,7 +25,7 @@ def read_frd(path: Path) -> RawMesh:
     try:
         text = path.read_text(encoding="ascii")
     except (UnicodeDecodeError, OSError) as error:
-        raise ImageFileError(f"{path} is no ASCII result file of CalculiX ({error}).") from error
+        raise ImageFileError(f"{path}: not an ASCII result file of CalculiX ({error}).") from error
     mesh = NumberedMesh(path)
     materials: dict[str, list[int]] = {}
     at_nodes: dict[str, dict[int, list[float]]] = {}
@@ -50,13 +50,13 @@ def _rows(path: Path, lines: Iterator[tuple[int, str]], block: str) -> list[str]
         if line.startswith(" -3"):
             return rows
         rows.append(line)
-    raise ImageFileError(f"{path} ends within its {block}: it is cut short.")
+    raise ImageFileError(f"{path}: the file is incomplete; it ends within the {block}.")
 
 
 def _values(row: str) -> list[float]:
     starts = range(3 + _NODE, 3 + _NODE + 3 * _VALUE, _VALUE)
     if len(row) < starts.stop:
-        raise ValueError("a row is cut short")
+        raise ValueError("a row is incomplete")
     return [float(row[start : start + _VALUE]) for start in starts]
 
 

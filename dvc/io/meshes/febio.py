@@ -46,14 +46,14 @@ def read_xplt(path: Path) -> RawMesh:
     with damage_named(f"{path}: its sections"):
         data = path.read_bytes()
         if len(data) < 4 or struct.unpack_from("<I", data)[0] != _MAGIC:
-            raise ImageFileError(f"{path} is no plot file of FEBio.")
+            raise ImageFileError(f"{path}: not a FEBio plot file.")
         last: dict[int, bytes] = {}
         for tag, body in _sections(data):
             if tag == _MESH and tag in last:
-                raise ImageFileError(f"{path}: its mesh changes between states (remeshing), and one mesh is read.")
+                raise ImageFileError(f"{path}: the mesh changes between states (remeshing), which is not supported.")
             last[tag] = body
         if _ROOT not in last or _MESH not in last:
-            raise ImageFileError(f"{path} has no mesh: it is cut short.")
+            raise ImageFileError(f"{path}: the file is incomplete; it has no mesh.")
         points, ids = _nodes(last[_MESH])
         fields = _displacement(path, last[_ROOT], last[_STATE], len(points)) if _STATE in last else {}
         return RawMesh(path, points, ids, *_cells(path, last[_MESH]), at_nodes=fields)
@@ -66,14 +66,14 @@ def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
         tag, size = struct.unpack_from("<II", data, at) if len(data) >= at + 8 else (0, 0)
         if tag in (_ROOT, _MESH, _STATE):
             if at + 8 + size > len(data):
-                raise ValueError("its last section is cut short")
+                raise ValueError("the last section is incomplete")
             yield tag, data[at + 8 : at + 8 + size]
             at += 8 + size
         else:
             stream = zlib.decompressobj()
             plain = stream.decompress(data[at:])
             if not stream.eof:
-                raise ValueError("its last section is cut short")
+                raise ValueError("the last section is incomplete")
             yield from _chunks(plain)
             at = len(data) - len(stream.unused_data)
 
@@ -83,7 +83,7 @@ def _chunks(body: bytes) -> Iterator[tuple[int, bytes]]:
     while at < len(body):
         tag, size = struct.unpack_from("<II", body, at)
         if at + 8 + size > len(body):
-            raise ValueError(f"chunk {tag:#x} is longer than what holds it")
+            raise ValueError(f"chunk {tag:#x} is longer than the section that contains it")
         yield tag, body[at + 8 : at + 8 + size]
         at += 8 + size
 
@@ -122,14 +122,14 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
     for _, domain in _chunks(_at(mesh, _DOMAINS)):
         number, part = _number(_at(domain, *_KIND)), _number(_at(domain, *_PART))
         if number in (5, 19):  # they carry no tissue
-            _log.info("%s: springs and beams are left out.", path)
+            _log.info("%s: springs and beams are skipped.", path)
             continue
         if number not in _KINDS:
-            raise ImageFileError(f"{path}: elements of FEBio's type {number} are not read.")
+            raise ImageFileError(f"{path}: elements of FEBio type {number} are not supported.")
         width, kind, taken = _KINDS[number]
         rows = np.frombuffer(_at(domain, _ELEMENTS), "<u4").reshape(-1, width + 3)
         if not ((rows[:, 0] == _ELEMENT).all() and (rows[:, 1] == 4 * (width + 1)).all()):
-            raise ValueError(f"an element of a domain of {kind} has another number of nodes")
+            raise ValueError(f"an element in a domain of {kind} has a wrong number of nodes")
         blocks.append((kind, rows[:, 3 : 3 + taken].astype(np.int64)))
         name = names.get(part) or f"part {part}"
         parts.setdefault(name, []).append(np.arange(known, known + len(rows)))
@@ -141,7 +141,7 @@ def _displacement(path: Path, root: bytes, state: bytes, count: int) -> dict[str
     """Displacement in a state, (n, 3), by its name; empty where it has none."""
     status = _at(state, *_STATUS)
     if status and _number(status):
-        _log.warning("%s: FEBio marks its last state with status %d.", path, _number(status))
+        _log.warning("%s: the last state has FEBio error status %d; check the run.", path, _number(status))
     names = [_text(_at(item, _ITEM_NAME)) for tag, item in _chunks(_at(root, *_NODAL_NAMES)) if tag == _ITEM]
     wanted = names.index(_DISPLACEMENT) + 1 if _DISPLACEMENT in names else None
     for _, variable in _chunks(_at(state, *_NODE_DATA)):

@@ -52,7 +52,7 @@ class NumberedMesh:
         if number in self.elements:
             raise ImageFileError(f"{self.path}: element {number} is defined twice.")
         if len(nodes) != num_nodes_per_cell[kind]:
-            counts = f"{len(nodes)} nodes; a {kind} has {num_nodes_per_cell[kind]}"
+            counts = f"{len(nodes)} nodes, but a {kind} needs {num_nodes_per_cell[kind]}"
             raise ImageFileError(f"{self.path}: element {number} has {counts}. The file is damaged.")
         self.elements[number] = kind, nodes
 
@@ -62,10 +62,10 @@ class NumberedMesh:
     ) -> RawMesh:  # fmt: skip
         """The mesh by indices, cells grouped by kind; sets may name what was left out, elements and fields may not."""
         if not self.nodes:
-            raise ImageFileError(f"{self.path} has no nodes: there is no mesh in it.")
+            raise ImageFileError(f"{self.path}: no mesh in this file (no nodes).")
 
         def undefined(whose: str, node: int) -> ImageFileError:
-            return ImageFileError(f"{self.path}: {whose} node {node}, which the file does not define.")
+            return ImageFileError(f"{self.path}: {whose} node {node}, which is not defined in the file.")
 
         index_of = {number: index for index, number in enumerate(self.nodes)}
         blocks: dict[str, dict[int, list[int]]] = {}
@@ -105,4 +105,4 @@ def damage_named(place: str) -> Iterator[None]:
     except ImageFileError:
         raise
     except _DAMAGE as error:
-        raise ImageFileError(f"{place} could not be read ({error}); the file is damaged.") from error
+        raise ImageFileError(f"{place} cannot be read ({error}); the file is damaged.") from error

@@ -132,13 +132,13 @@ def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFil
     """
     path = Path(path)
     if unit not in [*MM_PER_UNIT]:
-        raise InputError(f"The unit of a mesh is mm or m; got {unit!r}.")
+        raise InputError(f"The unit of a mesh must be mm or m; got {unit!r}.")
     if frame not in [*TO_LPS]:
-        raise InputError(f"The frame of a mesh is LPS or RAS; got {frame!r}.")
+        raise InputError(f"The frame of a mesh must be LPS or RAS; got {frame!r}.")
     if path.suffix.lower() not in _READERS:
-        raise InputError(f"{path}: a mesh is a file ending in {', '.join(_READERS)}; got {path.suffix!r}.")
+        raise InputError(f"{path}: the name of a mesh file must end in {', '.join(_READERS)}; got {path.suffix!r}.")
     if not path.is_file():
-        raise ImageFileError(f"{path}: there is no such file.")
+        raise ImageFileError(f"{path}: no such file.")
     try:
         return _checked(_READERS[path.suffix.lower()](path), unit, frame)
     except (GeometryError, InputError) as error:
@@ -154,14 +154,13 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
     blocks = []
     for kind, nodes in raw.blocks:
         if kind.rstrip("0123456789") not in _CORNERS or kind not in num_nodes_per_cell:
-            raise ImageFileError(f"{path}: cells of kind {kind!r} are not read, only {', '.join(_CORNERS)}.")
+            raise ImageFileError(f"{path}: cells of kind {kind!r} are not supported, only {', '.join(_CORNERS)}.")
         index = checked_indices(f"{kind} cells", nodes, len(points), num_nodes_per_cell[kind])
         blocks.append(CellBlock(kind, frozen(index, np.int64)))
     volumes = [block for block in blocks if block.shape in _VOLUMES]
     if not volumes:
         kinds = ", ".join(sorted({block.kind for block in blocks})) or "no cells at all"
-        advice = "Results are given in the tissue: pass the volume mesh, not its surface."
-        raise ImageFileError(f"{path} holds no volume cells (found: {kinds}). {advice}")
+        raise ImageFileError(f"{path}: no volume cells (found: {kinds}). Pass the volume mesh, not its surface.")
     check_extent(points[np.unique(np.concatenate([block.nodes.ravel() for block in volumes]))])
     regions = {name: frozen(index, np.int64) for name, index in raw.regions.items() if len(index)}
     tets = _tetrahedra(raw, points, blocks, regions) if all(block.shape == "tetra" for block in volumes) else None

@@ -59,7 +59,7 @@ def read_gmsh(path: Path) -> RawMesh:
     for name, parts in mesh.cell_sets.items():  # version 4.1, where a cell may be in several groups
         if not name.startswith("gmsh:"):
             if len(parts) != len(starts):
-                raise ImageFileError(f"{path}: its $Elements section is cut short.")
+                raise ImageFileError(f"{path}: the $Elements section is incomplete.")
             own = [np.asarray(part, dtype=np.int64) + start for part, start in zip(parts, starts, strict=True)]
             groups.append((real[name], np.concatenate(own)))
     regions: dict[str, IntArray] = {}
@@ -75,7 +75,7 @@ def _node_numbers(path: Path, count: int) -> IntArray:
         version, mode, size = _section(data, b"MeshFormat").split()[:3]
     if version not in (b"2.2", b"4.1"):
         raise ImageFileError(
-            f"{path} is a Gmsh file of version {version.decode(errors='replace')}; 2.2 and 4.1 are read. "
+            f"{path}: Gmsh file version {version.decode(errors='replace')} is not supported, only 2.2 and 4.1. "
             "Save it again with Gmsh (Mesh.MshFileVersion = 4.1)."
         )
 
@@ -143,8 +143,8 @@ def _read(path: Path, read: Callable[[str], Any]) -> Any:
             # meshio meets damaged files with whatever Python raises: KeyError, ValueError, IndexError ...
             reason = " ".join(f"{type(error).__name__}: {error} {said.getvalue()}".split())
             raise ImageFileError(
-                f"{path} cannot be read as a mesh ({reason}). It is damaged, or of a variant that is not "
-                "read; write it again as VTU."
+                f"{path}: cannot be read as a mesh ({reason}). The file is damaged, or its variant is not "
+                "supported; write it again as VTU."
             ) from error
 
 

@@ -59,7 +59,7 @@ def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, v
     path = Path(path)
     _check_name(path, ".csv", mesh)
     if np.shape(u_mm) != mesh.points_mm.shape:
-        raise InputError(f"u_mm must have shape {mesh.points_mm.shape}, a row for each node; got {np.shape(u_mm)}.")
+        raise InputError(f"u_mm must have shape {mesh.points_mm.shape}, one row per node; got {np.shape(u_mm)}.")
     _, own_u = _in_own_frame(mesh, "u_mm", u_mm, len(u_mm), "node")
     undefined = np.asarray(np.isnan(own_u).any(axis=1))
     columns = ["node", *(f"{axis}_{mesh.unit}" for axis in ("x", "y", "z", "ux", "uy", "uz"))]
@@ -85,11 +85,11 @@ def _in_own_frame(mesh: MeshFile, name: str, values: FloatArray, rows: int, what
     values = np.asarray(values, dtype=np.float64)
     if values.ndim == 0 or len(values) != rows or values.shape[1:] not in {(), (3,), (3, 3)}:
         raise InputError(
-            f"{name!r} must have a row for each of the {rows} {what}s, of a scalar, a vector (3,) or a "
-            f"tensor (3, 3); got shape {values.shape}."
+            f"{name!r} must have {rows} rows, one per {what}, each a scalar, a vector (3,) or a tensor (3, 3); "
+            f"got shape {values.shape}."
         )
     if name == "node":
-        raise InputError("The name 'node' is kept for the nodes' own numbers; give the array another.")
+        raise InputError("The array name 'node' is reserved for the node numbers; use another name.")
     sign = TO_LPS[mesh.frame]
     if values.ndim == 2:
         values = values * sign
@@ -102,6 +102,6 @@ def _in_own_frame(mesh: MeshFile, name: str, values: FloatArray, rows: int, what
 
 def _check_name(path: Path, ending: str, mesh: MeshFile) -> None:
     if path.suffix.lower() != ending:
-        raise InputError(f"{path}: the name of this file must end in {ending}; got {path.suffix!r}.")
+        raise InputError(f"{path}: the file name must end in {ending}; got {path.suffix!r}.")
     if path.resolve() == mesh.path.resolve():
-        raise InputError(f"{path} is the mesh itself; results go into another file.")
+        raise InputError(f"{path}: this is the mesh itself; write the results to another file.")

@@ -27,7 +27,7 @@ def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
             continue
         shown = line if len(line) < 80 else line[:77] + "..."
         if not (line.startswith("(") and line.endswith(")")):
-            raise ParameterError(f"line {number}: '{shown}' is not between brackets; write (Name value ...).")
+            raise ParameterError(f"line {number}: '{shown}' is not in brackets; write (Name value ...).")
         pieces = line[1:-1].split('"')
         if len(pieces) % 2 == 0:
             raise ParameterError(f"line {number}: '{shown}' has an odd number of quotes.")
@@ -35,7 +35,7 @@ def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
         for position, piece in enumerate(pieces[1:], start=1):
             values += [piece] if position % 2 and piece else [] if position % 2 else piece.split()
         if not name or _BAD_NAME.search(name) or (not values and len(pieces) == 1):
-            raise ParameterError(f"line {number}: '{shown}' is not a parameter's name and one value or more.")
+            raise ParameterError(f"line {number}: '{shown}' is not a parameter name with one or more values.")
         if name in parameters:
             raise ParameterError(f"line {number}: the parameter {name} is given more than once.")
         parameters[name] = tuple(values)
@@ -60,5 +60,5 @@ def _formatted(name: str, value: Value) -> str:
     if _NUMBER.fullmatch(value):
         return value
     if '"' in value or "\n" in value or "//" in value:
-        raise ParameterError(f"{name}: an elastix file cannot hold the text {value!r} (a quote, line break or //).")
+        raise ParameterError(f"{name}: elastix files do not allow the text {value!r} (quote, line break or //).")
     return f'"{value}"'

@@ -40,16 +40,17 @@ def read_interface_spline(path: Path | str) -> InterfaceSpline:
     try:
         with np.load(io.BytesIO(Path(path).read_bytes())) as file:
             if int(file["format"]) != _FORMAT:
-                raise ValueError(f"format {int(file['format'])}, not {_FORMAT}")
+                raise ValueError(f"the format is {int(file['format'])}; {_FORMAT} is needed")
             if json.loads(str(file["numbers"])) != NUMBERS:
-                raise ValueError(f"borders found with {file['numbers']}, not {NUMBERS}; register again")
+                raise ValueError(f"interfaces were located with {file['numbers']}, now with {NUMBERS}; register again")
             control = _grid(file["control"])
             own = frozen(file["own"], np.int64)
             borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
             return InterfaceSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
     except (*_UNREADABLE, MrstrainError) as failure:
         why = f"{type(failure).__name__}: {failure}"
-        raise InputError(f"{path}: no displacement with borders as `mrstrain register` writes it ({why}).") from failure
+        what = "not a displacement with tissue interfaces written by `mrstrain register`"
+        raise InputError(f"{path}: {what} ({why}).") from failure
 
 
 _latest: list[Interfaces] = []

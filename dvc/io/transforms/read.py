@@ -61,9 +61,8 @@ def read_transform(path: StrPath) -> Deformation:
     Returns
     -------
     Deformation
-        Of fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix and ITK
-        answer with the identity. A displacement field inside an ITK file is interpolated by cubic splines (ITK:
-        linearly).
+        Maps fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix and ITK
+        return the identity. A displacement field in an ITK file is interpolated by cubic splines (in ITK: linearly).
 
     Raises
     ------
@@ -115,23 +114,23 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
     try:
         stored = read_header(place, vectors=True)
         if stored.unit != "mm":
-            raise ImageFileError(f"{place}: lengths in {stored.unit}; a displacement in mm is needed.")
+            raise ImageFileError(f"{place}: lengths are in {stored.unit}; a displacement in mm is needed.")
         declared |= {_frame_of_header(place)}
         values = stored.load()
     except OSError as failure:
-        raise ImageFileError(f"{place}: not readable as a displacement image ({failure}).") from failure
+        raise ImageFileError(f"{place}: cannot be read as a displacement image ({failure}).") from failure
     frames = sorted(f for f in declared if f is not None)
     if len(frames) != 1 or frames[0] not in ("LPS", "RAS"):
         raise ImageFileError(
-            f"{place}: the components' frame must be LPS or RAS, and the same wherever it is given; "
-            f"found {frames or 'none'}. Pass frame=, or set 'frame' in the JSON file beside it."
+            f"{place}: the frame of the components must be LPS or RAS, without contradiction; found "
+            f"{frames or 'none'}. Pass frame=, or set 'frame' in the JSON file of the same name."
         )
     infinite = np.isinf(values).any(axis=-1)
     if infinite.any():
         first = tuple(np.argwhere(infinite)[0].tolist())
         raise ImageFileError(
             f"{place}: the displacement of {int(infinite.sum())} of {infinite.size} voxels is infinite, the first at "
-            f"index {first}. Where it is not known, it is NaN: repair the file, or make it again."
+            f"index {first}. Unknown displacements must be NaN. Repair the file, or write it again."
         )
     signs = np.array([1.0, 1.0, 1.0] if frames[0] == "LPS" else [-1.0, -1.0, 1.0])
     try:
@@ -153,9 +152,9 @@ def bspline_from_elastix(parameters: Parameters) -> BSpline:
     """Read an elastix B-spline from its parameter map alone (an initial transform is left out); NaN is let pass."""
     _require(parameters, ("BSplineTransform", "RecursiveBSplineTransform"))
     if _word(parameters, "BSplineTransformSplineOrder", "3") != "3":
-        raise ParameterError("BSplineTransformSplineOrder is not 3; only cubic B-splines are read.")
+        raise ParameterError("BSplineTransformSplineOrder is not 3; only cubic B-splines are supported.")
     if _word(parameters, "UseCyclicTransform", "false") == "true":
-        raise ParameterError("UseCyclicTransform is true; cyclic B-splines are not read.")
+        raise ParameterError("UseCyclicTransform is true; cyclic B-splines are not supported.")
     size = _numbers(parameters, "GridSize", 3)
     shape = (int(size[0]), int(size[1]), int(size[2]))
     index = _numbers(parameters, "GridIndex", 3) if "GridIndex" in parameters else np.zeros(3)
@@ -169,7 +168,7 @@ def bspline_from_elastix(parameters: Parameters) -> BSpline:
         control = Grid(shape, spacing, origin + direction @ (spacing * index), direction)
         return BSpline(control, coefficients)
     except InputError as wrong:
-        raise ParameterError(f"The control grid cannot be used: {wrong}") from wrong
+        raise ParameterError(f"The grid of the control points is not valid: {wrong}") from wrong
 
 
 def _affine_from_elastix(parameters: Parameters) -> Affine:
@@ -194,12 +193,12 @@ _ELASTIX: dict[str, Callable[[Parameters], Deformation]] = {
 
 def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
     if path.resolve() in chain:
-        raise ParameterError(f"{path}: its initial transforms lead back to itself.")
+        raise ParameterError(f"{path}: the chain of initial transforms leads back to this file.")
     try:
         parameters = parse_parameters(path.read_text())
         last = _last_of_chain(path, parameters)
     except (OSError, UnicodeDecodeError) as failure:
-        raise InputError(f"{path}: not readable as an elastix transform file ({failure}).") from failure
+        raise InputError(f"{path}: cannot be read as an elastix transform file ({failure}).") from failure
     except ParameterError as wrong:
         raise ParameterError(f"{path}: {wrong}") from wrong
     older = _word(parameters, "InitialTransformParametersFileName", _NO_INITIAL)
@@ -209,15 +208,15 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
     initial = path.parent / name  # an absolute name stays what it is
     if not initial.is_file():
         raise InputError(
-            f"{path}: its initial transform '{name}' is not there. Put it beside this file and write "
-            "its bare name as InitialTransformParameterFileName."
+            f"{path}: the initial transform '{name}' is missing. Copy it to the same folder, and set "
+            "InitialTransformParameterFileName to its file name without a path."
         )
     first = _read_elastix(initial, (*chain, path.resolve()))
     how = _word(parameters, "HowToCombineTransforms", "Compose")
     if how == "Compose":
         return Composed([*_flat(first), last])
     if how != "Add":
-        raise ParameterError(f"{path}: HowToCombineTransforms is '{how}'; it is Compose or Add.")
+        raise ParameterError(f"{path}: HowToCombineTransforms must be Compose or Add; it is '{how}'.")
     splines = [part for part in (first, last) if isinstance(part, BSpline)]
     if len(splines) == 2 and splines[0].control.same_as(splines[1].control, tolerance_voxels=_SAME_CONTROL):
         return splines[1].plus(splines[0])
@@ -229,14 +228,14 @@ def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
     if kind == "File":
         named = path.parent / _word(parameters, "TransformFileName", "")
         if not named.is_file():
-            raise InputError(f"{path}: the ITK transform file '{named.name}' that it names is not there.")
+            raise InputError(f"{path}: the ITK transform file '{named.name}' (TransformFileName) is missing.")
         return _read_itk(named)
     _require(parameters, tuple(_ELASTIX))
     ignored = _word(parameters, "UseDirectionCosines", "true") == "false" and "Direction" in parameters
     if ignored and np.abs(_numbers(parameters, "Direction", 9) - np.eye(3).ravel()).max() > _SAME_CONTROL:
         raise ParameterError(
-            "UseDirectionCosines is false, so this transform knows nothing of the image's direction and is "
-            'not in LPS mm. Register again with (UseDirectionCosines "true").'
+            "UseDirectionCosines is false, so this transform ignores the direction of the image and is not in LPS "
+            'mm. Register again with (UseDirectionCosines "true").'
         )
     made = _ELASTIX[kind](parameters)
     if isinstance(made, BSpline) and not np.isfinite(made.coefficients_mm).all():
@@ -247,12 +246,12 @@ def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
 def _require(parameters: Parameters, kinds: tuple[str, ...]) -> None:
     kind = _word(parameters, "Transform", "")
     if kind not in kinds:
-        raise ParameterError(f'(Transform "{kind}") is not read here; what is read: {", ".join(kinds)}.')
+        raise ParameterError(f'(Transform "{kind}") is not supported; supported: {", ".join(kinds)}.')
     for name in ("FixedImageDimension", "MovingImageDimension"):
         if _word(parameters, name, "3") != "3":
-            raise ParameterError(f"{name} is {_word(parameters, name, '')}; transforms of 3D images are read.")
+            raise ParameterError(f"{name} is {_word(parameters, name, '')}; a transform of 3D images is needed.")
     if _word(parameters, "UseBinaryFormatForTransformationParameters", "false") == "true":
-        raise ParameterError("its parameters are in a binary file beside it; let elastix write them as text.")
+        raise ParameterError("the parameters are in a separate binary file; let elastix write them as text.")
 
 
 def _word(parameters: Parameters, name: str, default: str) -> str:
@@ -266,7 +265,7 @@ def _numbers(parameters: Parameters, name: str, count: int) -> FloatArray:
     try:
         values = np.array(parameters[name], dtype=np.float64)
     except ValueError as failure:
-        raise ParameterError(f"{name} holds something that is not a number ({failure}).") from failure
+        raise ParameterError(f"{name} has a value that is not a number ({failure}).") from failure
     if len(values) != count:
         raise ParameterError(f"{name} has {len(values)} numbers; {count} are needed.")
     return values
@@ -281,7 +280,7 @@ def _read_itk(path: Path) -> Deformation:
         return _from_sitk(sitk.ReadTransform(os.fspath(path)))
     except RuntimeError as failure:
         reason = str(failure).strip().splitlines()[-1].strip()
-        raise InputError(f"{path}: not readable as an ITK transform file ({reason}).") from failure
+        raise InputError(f"{path}: cannot be read as an ITK transform file ({reason}).") from failure
     except InputError as wrong:
         raise InputError(f"{path}: {wrong}") from wrong
 
@@ -296,7 +295,7 @@ def _from_sitk(transform: Any) -> Deformation:
         return flat[0] if len(flat) == 1 else Composed(flat or [RigidMotion.identity()])
     if isinstance(transform, sitk.BSplineTransform):
         if transform.GetOrder() != 3:
-            raise InputError(f"a B-spline of order {transform.GetOrder()}; only cubic ones are read.")
+            raise InputError(f"a B-spline of order {transform.GetOrder()}; only cubic B-splines are supported.")
         images = [image_from_sitk(image) for image in transform.GetCoefficientImages()]
         return BSpline(images[0][0], np.stack([coefficients for _, coefficients in images]))
     if isinstance(transform, sitk.DisplacementFieldTransform):
@@ -307,7 +306,7 @@ def _from_sitk(transform: Any) -> Deformation:
     if transform.GetTransformEnum() == sitk.sitkIdentity:
         return RigidMotion.identity()
     if not hasattr(transform, "GetMatrix"):
-        raise InputError(f"a transform of the kind {transform.GetName()} is not read.")
+        raise InputError(f"transforms of the kind {transform.GetName()} are not supported.")
     matrix = np.reshape(transform.GetMatrix(), (3, 3))
     shift = transform.GetTranslation() if hasattr(transform, "GetTranslation") else np.zeros(3)
     rigid = isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform)
@@ -323,9 +322,9 @@ def _frame_beside(path: Path) -> str | None:
         header = json.loads(beside.read_text(encoding="utf-8"))
         frame, unit = header.get("frame"), header.get("unit", "mm")
     except (OSError, ValueError, AttributeError) as failure:
-        raise ImageFileError(f"{beside}: not readable as a JSON object ({failure}).") from failure
+        raise ImageFileError(f"{beside}: cannot be read as a JSON object ({failure}).") from failure
     if unit != "mm" or header.get("configuration", "reference") != "reference":
-        raise ImageFileError(f"{beside}: a displacement in mm on the reference configuration is needed; got {header}.")
+        raise ImageFileError(f"{beside}: a displacement in mm in the reference configuration is needed; got {header}.")
     return None if frame is None else str(frame)
 
 

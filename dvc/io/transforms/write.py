@@ -86,7 +86,7 @@ def write_itk_transform(
     """
     place = Path(path)
     if place.suffix.lower() not in (".h5", ".tfm"):
-        raise InputError(f"{place}: ITK transforms are written as .h5 or .tfm; choose one of these endings.")
+        raise InputError(f"{place}: the name of an ITK transform must end in .h5 or .tfm.")
     composite = sitk.CompositeTransform(3)
     if then is not None:  # what is added last acts first
         motion = sitk.AffineTransform(3)
@@ -110,7 +110,7 @@ def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
         case InterfaceSpline(borders=borders):
             grid = borders.grid
     if grid is None:
-        raise InputError(f"To write a {type(displacement).__name__} for ITK, give the grid of its displacement field.")
+        raise InputError(f"Writing a {type(displacement).__name__} for ITK needs the grid of its displacement field.")
     return sitk.DisplacementFieldTransform(
         to_sitk(grid, np.nan_to_num(displacement_on_grid(displacement, grid, np.float64), copy=False))
     )

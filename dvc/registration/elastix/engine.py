@@ -36,12 +36,12 @@ class Elastix(Engine):
     Attributes
     ----------
     presets : tuple of Preset
-        Stages, one after the other; each starts from the coefficients of the one before. "heel-mr" by default.
+        Stages in sequence; each starts from the coefficients of the previous one. "heel-mr" by default.
 
     Raises
     ------
     ParameterError
-        If there is no stage, one finds no B-spline, or two end with different spacings of control points.
+        If there is no stage, a stage is not a B-spline, or two stages end with different control point spacings.
     """
 
     presets: tuple[Preset, ...] = field(default_factory=lambda: (load_preset("heel-mr"),))
@@ -53,34 +53,34 @@ class Elastix(Engine):
 
     def __post_init__(self) -> None:
         if not self.presets:
-            raise ParameterError("No registration stage given; name a preset or parameter files.")
+            raise ParameterError("No registration stage was given; pass a preset or parameter files.")
         for preset in self.presets:
             if "BSplineTransform" not in preset.transform:
                 raise ParameterError(
-                    f'{preset.name}: (Transform "{preset.transform}") is no B-spline; the non-rigid stage needs '
+                    f'{preset.name}: (Transform "{preset.transform}") is not a B-spline; the non-rigid stage needs '
                     '"RecursiveBSplineTransform" or "BSplineTransform".'
                 )
         given = (preset.parameters for preset in self.presets)
         spacings = {p.get(_SPACING, p.get("FinalGridSpacingInVoxels", ("default",))) for p in given}
         if len(spacings) > 1:
             raise ParameterError(
-                f"The stages end with different spacings of control points: {sorted(map(' '.join, spacings))}. Each "
-                f"stage starts from the coefficients of the one before, so {_SPACING} must be the same in all."
+                f"The stages end with different control point spacings: {sorted(map(' '.join, spacings))}. Each stage "
+                f"starts from the coefficients of the previous one, so {_SPACING} must be equal in all stages."
             )
 
     @property
     def name(self) -> str:
-        """Name of the last preset or parameter file, which an error model is known by."""
+        """Name of the last preset or parameter file, which also names the error model."""
         return self.presets[-1].name
 
     @property
     def text(self) -> str:
-        """All stages' parameters, as written."""
+        """The parameters of all stages, as written."""
         return "\n".join(preset.text for preset in self.presets)
 
     @property
     def needs_one_contrast(self) -> bool:
-        """Whether what is brighter than its neighbours must be so in both images: not for mutual information."""
+        """Whether the two images must have the same contrast; not for mutual information."""
         metrics = [metric for preset in self.presets for metric in preset.parameters.get("Metric", ())]
         return not any("MutualInformation" in metric for metric in metrics)
 
@@ -91,12 +91,12 @@ class Elastix(Engine):
 
     @property
     def without_error_model(self) -> str:
-        """Why no error model can be made for it; empty for a single stage."""
+        """Why there can be no error model for it; empty for a single stage."""
         several = len(self.presets) > 1
-        return "The error of several stages, one after the other, has not been measured." if several else ""
+        return "The error of several elastix stages in sequence has not been measured." if several else ""
 
     def check_start(self, start: Deformation) -> None:
-        """Refuse, by InputError, a start that is no B-spline."""
+        """InputError for a start that is not a B-spline."""
         _as_bspline(start)
 
     def record(self) -> dict[str, object]:
@@ -106,7 +106,7 @@ class Elastix(Engine):
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
         stages = record.get("stages") or []
         if not stages or record.get("gauss_newton"):
             return ""
@@ -134,7 +134,7 @@ def _as_bspline(start: Deformation) -> BSpline:
     if isinstance(start, BSpline):
         return start
     raise InputError(
-        f"elastix starts from one B-spline; got {type(start).__name__}. Start from a result without tissue "
+        f"elastix can start only from one B-spline; got {type(start).__name__}. Start from a result without tissue "
         "interfaces, or register with gauss-newton."
     )
 
@@ -156,7 +156,7 @@ def _one_stage(
     tell(1.0)
     bspline = bspline_from_elastix(found)
     if not np.isfinite(bspline.coefficients_mm).all():
-        raise RegistrationError(f"{preset.name}: elastix' optimiser diverged (coefficients are not finite).")
+        raise RegistrationError(f"{preset.name}: the elastix optimiser diverged (coefficients are not finite).")
     return bspline.plus(start) if start is not None else bspline
 
 
@@ -174,7 +174,10 @@ def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str,
         return parameters
     used = " x ".join(f"{s:.3g}" for s in spacing)
     _log.warning(
-        "The unloaded image, %s, is too coarse for control points every %g mm; %s mm are used.", grid, given[0], used
+        "The unloaded image (%s) is too coarse for control points every %g mm; a spacing of %s mm is used.",
+        grid,
+        given[0],
+        used,
     )
     return parameters | {_SPACING: tuple(f"{s:.6g}" for s in spacing)}
 
@@ -192,7 +195,7 @@ def _stage_methods(stage: Mapping[str, Any]) -> str:
 
     return (
         f"parameters '{stage.get('name')}', metric {value('Metric')}, {value('Transform')} with control points every "
-        f"{value(_SPACING)} mm (every two voxels, if that is more), {value('NumberOfResolutions')} resolutions, "
+        f"{value(_SPACING)} mm (or two voxels, if that is larger), {value('NumberOfResolutions')} resolutions, "
         f"{value('Optimizer')} with {value('MaximumNumberOfIterations')} iterations of "
         f"{value('NumberOfSpatialSamples')} samples"
     )

@@ -88,7 +88,7 @@ def load_preset(name: str) -> Preset:
     ('AdvancedNormalizedCorrelation',)
     """
     if name not in preset_names():
-        raise ParameterError(f"No preset '{name}'; there are {', '.join(preset_names())}.")
+        raise ParameterError(f"Unknown preset '{name}'; choose one of {', '.join(preset_names())}.")
     return _checked(name, (_FOLDER / f"{name}.txt").read_text(), allow_unknown=False)
 
 
@@ -98,19 +98,19 @@ def read_parameter_file(path: Path | str, *, allow_unknown: bool = False) -> Pre
     Parameters
     ----------
     allow_unknown : bool
-        Accept parameter names that are not in our list (a newer elastix may have more).
+        Accept parameter names that mrstrain does not know (a newer elastix may have more).
 
     Raises
     ------
     InputError
         If the file cannot be read.
     ParameterError
-        For a name, or a component, that elastix does not know: with the nearest that it does.
+        For a name or component that elastix does not know; the message gives the closest known name.
     """
     try:
         text = Path(path).read_text()
     except (OSError, UnicodeDecodeError) as failure:
-        raise InputError(f"Cannot read the elastix parameter file {path}: {failure}.") from failure
+        raise InputError(f"{path}: the elastix parameter file cannot be read ({failure}).") from failure
     return _checked(Path(path).name, text, allow_unknown=allow_unknown)
 
 
@@ -125,21 +125,21 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
         spellings = {parameter, parameter.rstrip("0123456789"), bare}
         if not names & spellings and not (_LABEL.match(parameter) and "Metric" + bare in names):
             raise ParameterError(
-                f"{name}: elastix has no parameter '{parameter}' and would ignore it in silence; "
-                f"{_nearest(parameter, names)} Pass --allow-unknown-parameters if it is right all the same."
+                f"{name}: elastix has no parameter '{parameter}' and would ignore it without a message; "
+                f"{_nearest(parameter, names)} If the name is correct, pass --allow-unknown-parameters."
             )
     for kind, components in components_of.items():
         for value in parameters.get(kind, ()):
             if value not in components:
                 raise ParameterError(f'{name}: elastix has no {kind} "{value}"; {_nearest(value, components)}')
     if "Transform" not in parameters:
-        raise ParameterError(f'{name}: no (Transform "...") given; a B-spline or Euler transform is needed.')
+        raise ParameterError(f'{name}: (Transform "...") is missing; give a B-spline or Euler transform.')
     return Preset(name, text, parameters)
 
 
 def _nearest(name: str, known: Sequence[str] | frozenset[str]) -> str:
     near = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
-    return f"the nearest that it knows is '{near[0]}'." if near else "nothing that it knows is near."
+    return f"the closest known name is '{near[0]}'." if near else "no known name is similar."
 
 
 @cache

@@ -69,8 +69,8 @@ def self_test() -> str:
         found = register(Image(grid, values), Image(shifted, values), parameters, None, None, None, folder)
     shift = float(found["TransformParameters"][0])
     if abs(shift - 1.5) > 0.05:
-        raise RegistrationError(f"elastix found a shift of {shift:.3f} mm where 1.5 mm is true.")
-    return f"a shift of 1.5 mm was found as {shift:.3f} mm"
+        raise RegistrationError(f"elastix measured a shift of {shift:.3f} mm; the true shift is 1.5 mm.")
+    return f"a shift of 1.5 mm was measured as {shift:.3f} mm"
 
 
 def finished_iterations(folder: Path) -> int:
@@ -87,9 +87,9 @@ def _reason_in(log: Path) -> str:
     try:
         text = log.read_text(errors="replace")
     except OSError:
-        return "it left no log; the images may hold values it cannot use"
+        return "it wrote no log; the images may have values that it cannot use"
     described = re.findall(r"Description:\s*(?:ITK ERROR:)?\s*(.+)", text)
     told = [line.strip() for line in text.splitlines() if re.search(r"\berror\b|exception", line, re.IGNORECASE)]
     reasons = [re.sub(r"\(0x[0-9a-f]+\)", "", r).strip() for r in (described or told)]
     unique = list(dict.fromkeys(r for r in reasons if r and not r.startswith("---")))
-    return "; ".join(unique[:3]) if unique else f"its log gives no reason; its last line is: {text.strip()[-200:]}"
+    return "; ".join(unique[:3]) if unique else f"its log gives no reason; the log ends with: {text.strip()[-200:]}"

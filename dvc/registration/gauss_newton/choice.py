@@ -1,4 +1,4 @@
-"""How strongly a Gauss-Newton registration smoothed, and why."""
+"""The regularisation weights of a Gauss-Newton registration, and why they were chosen."""
 
 from dataclasses import asdict, dataclass
 
@@ -11,12 +11,12 @@ _ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceed
 
 @dataclass(frozen=True, slots=True)
 class Choice(Regularisation):
-    """The prior's weights that were used, and why.
+    """The regularisation weights that were used, and why.
 
-    Each weight that was tried stands beside the mean square residual of the voxels left out, over that of the best.
-    `asked` is the change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where
-    the weight of the change of volume was fixed beforehand. `in_bone` is the displacement (rms, mm) and the 95th
-    percentile of the maximum shear in the bone, of the smooth displacement that came before one with a rigid bone.
+    Each weight that was tried is paired with the mean square residual in the voxels left out, relative to the lowest.
+    `asked` is the volume change that 1 % of the soft tissue exceeds if only its gradient is penalised; None if the
+    weight of the volume change was fixed beforehand. `in_bone` is the displacement (rms, mm) and the 95th percentile of
+    the maximum shear strain in the bone, from the smooth displacement that preceded the one with a rigid bone.
     """
 
     weights: Weights
@@ -29,37 +29,37 @@ class Choice(Regularisation):
 
     @property
     def frees_volume(self) -> bool:
-        """Whether the images ask for a change of volume, so that only its gradient was held."""
+        """Whether the images indicate a volume change, so that only its gradient was penalised."""
         return self.asked is not None and self.asked > _ASKED
 
     @property
     def caution(self) -> str:
         """Why the result is to be used with care: of the change of volume, two thirds to all came back on phantoms."""
-        return f"{self.volume_told} It may be larger than was found." if self.frees_volume else ""
+        return f"{self.volume_told} The true change may be larger." if self.frees_volume else ""
 
     @property
     def volume_told(self) -> str:
-        """How the change of volume was held, and why."""
+        """How the volume change was penalised, and why."""
         if self.asked is None:
-            return f"Its weight was fixed beforehand, {self.weights.volume:g}/mm3."
-        found = f"{100.0 * self.asked:.1f} % or more in a hundredth of the soft tissue"
+            return f"The weight of the volume change was fixed at {self.weights.volume:g}/mm3."
+        found = f"at least {100.0 * self.asked:.1f} % in 1 % of the soft tissue"
         if not self.frees_volume:
-            return f"The images ask for no more change of volume than noise does, {found}: volume was kept."
-        held = f"only its gradient held ({self.weights.volume_gradient:g}/mm)"
-        return f"The images ask for a change of volume, of {found}: it was allowed, and {held}."
+            return f"Incompressibility was kept: the images indicate no more volume change than noise ({found})."
+        relaxed = f"Incompressibility was relaxed: the images indicate volume changes of {found}."
+        return f"{relaxed} Only the gradient of the volume change was penalised ({self.weights.volume_gradient:g}/mm)."
 
     @property
     def caption(self) -> str:
         """The rules by which the weights were chosen."""
-        return f"{self.rule}. {self.volume_told}"
+        return f"{self.rule[:1].upper()}{self.rule[1:]}. {self.volume_told}"
 
     def rows(self) -> list[tuple[str, float, str, str | float]]:
         """Each weight: what it penalises, its value, its unit, and "used" or what it left out, % above the least."""
         stiff = f"strain of {_RIGID[self.at_interfaces]}"
         return [
             ("bending", self.weights.bending, "1/mm", "used"),
-            ("change of volume in soft tissue", self.weights.volume, "1/mm3", "used"),
-            ("gradient of that change", self.weights.volume_gradient, "1/mm", "used"),
+            ("volume change in soft tissue", self.weights.volume, "1/mm3", "used"),
+            ("gradient of the volume change", self.weights.volume_gradient, "1/mm", "used"),
             (stiff, self.weights.rigidity, "1/mm3", "used"),
             *(("bending", weight, "1/mm", 100.0 * (left - 1.0)) for weight, left in self.tried),
             *((stiff, weight, "1/mm3", 100.0 * (left - 1.0)) for weight, left in self.tried_in_skin),

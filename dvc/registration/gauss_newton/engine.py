@@ -20,10 +20,10 @@ from dvc.worker import Worker
 
 _UNLABELLED = 0.1  # of the body: more than that was never in a phantom
 _NOTE = (
-    "Strain may be discontinuous at the tissue interfaces of the label map, and the bone that was aligned on is rigid: "
-    "the figures of the bone are those of the smooth spline before it. Labels that are off by more than a voxel spoil "
-    "the result (use --no-borders then). The whole motion is in transform.h5, as displacements at voxels; elastix has "
-    "no spline with discontinuities, so no elastix text files are written."
+    "Strain may be discontinuous at the tissue interfaces of the label map. The bone of the rigid alignment is rigid; "
+    "its figures are those of the preceding smooth spline. Labels that are off by more than a voxel degrade the "
+    "result: use --no-borders then. The whole motion is in transform.h5, as displacements at voxels. No elastix text "
+    "files are written, because elastix has no spline with discontinuities."
 )
 
 
@@ -36,9 +36,10 @@ class GaussNewton(Parameters, Engine):
     spacing_mm : float
         Between control points, at the finest level; never less than two voxels.
     bending : float or None
-        Weight of the bending, 1/mm; None: chosen for each pair by cross-validation. Fixed, it costs the error bars.
+        Weight of the bending, 1/mm; None: chosen for each pair by cross-validation. With a fixed weight there are no
+        error bars.
     volume : float or None
-        Weight of the change of volume in soft tissue, 1/mm3; None: 300, unless the images ask for such a change.
+        Weight of the volume change in soft tissue, 1/mm3; None: 300, unless the images indicate a volume change.
     rigidity : float
         Weight of strain in the bone, 1/mm3.
 
@@ -49,24 +50,24 @@ class GaussNewton(Parameters, Engine):
 
     Notes
     -----
-    `Measurement.sigma` and `.intervals` are known only for the parameters that the error model was measured with: the
-    bending chosen by cross-validation, the default spacing and rigidity, `volume` None or 300. To keep error bars,
-    leave the others alone; `Measurement.error_bars.told` says why there are none. Repeat scans get 3/mm in any case.
+    `Measurement.sigma` and `.intervals` are available only for the parameters of the error model: `bending` chosen by
+    cross-validation, the default spacing and rigidity, and `volume` None or 300. Otherwise
+    `Measurement.error_bars.told` gives the reason. Repeat scans are always registered with a bending of 3/mm.
     """
 
     family = name = "gauss-newton"
 
     @property
     def unlike_its_error_model(self) -> str:
-        """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
+        """Why the error model of this name is not valid, if it was made with other parameters."""
         return _unlike(self.name, self)
 
     def of_repeat(self) -> Self:
-        """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
+        """With the default weights: weights chosen for a pair without strain would smooth away the noise floor."""
         return replace(self, bending=self.weights.bending, volume=self.weights.volume)
 
     def keeping_volume(self) -> Self:
-        """With the weight of tissue that keeps its volume, whatever the images ask for."""
+        """With the weight of incompressible tissue, whatever the images indicate."""
         return replace(self, volume=self.weights.volume)
 
     def record(self) -> dict[str, object]:
@@ -75,27 +76,27 @@ class GaussNewton(Parameters, Engine):
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
         own = record.get("gauss_newton")
         if not own or record.get("borders") is not None:
             return ""
         bending, volume = own.get("bending"), own.get("volume")
         weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
-        by_rule = "300/mm3, or of its gradient alone where the images ask for such a change"
+        by_rule = "300/mm3, or on its gradient alone where the images indicate such a change"
         kept = by_rule if volume is None else f"{volume:g}/mm3"
-        held = f" and on change of volume in the tissue ({kept})"
+        held = f" and on volume change in the tissue ({kept})"
         if record.get("align") == "bone":
             rigid = f"strain of the bone ({own.get('rigidity'):g}/mm3)"
-            held = f", on change of volume in soft tissue ({kept}) and on {rigid}"
+            held = f", on volume change in soft tissue ({kept}) and on {rigid}"
         return (
             f"with the Gauss-Newton engine of mrstrain {versions.get('mrstrain', '?')}: a cubic B-spline with control "
-            f"points every {own.get('spacing_mm'):g} mm (every two voxels, if that is more), least squares over all "
-            "voxels of the tissue and 3 mm around it, and penalties on bending (the square of the Laplacian of its "
-            f"coefficients, less where the displacement is curved; weight {weight}){held}"
+            f"points every {own.get('spacing_mm'):g} mm (or two voxels, if that is larger), fitted by least squares "
+            "over all voxels of the tissue and 3 mm around it, with penalties on bending (the squared Laplacian of the "
+            f"coefficients, reduced where the displacement is curved; weight {weight}){held}"
         )
 
     def prepare(self) -> None:
-        """Compile its loops, where no run has before."""
+        """Compile the loops, if no run has done so before."""
         compile_loops(lambda pair: fit(pair, self))
 
     def find(
@@ -113,7 +114,7 @@ class GaussNewtonWithInterfaces(Engine):
     Attributes
     ----------
     smooth : GaussNewton
-        What comes before, and the weights for both.
+        The smooth spline that is fitted first, with the weights of both fits.
     skin : float or None
         Weight k of strain in the skin, 1/mm3; None: chosen for each pair by cross-validation.
 
@@ -137,20 +138,20 @@ class GaussNewtonWithInterfaces(Engine):
 
     @property
     def text(self) -> str:
-        """Every number that decides the result, as JSON: those of the smooth spline, and those of the last stage."""
+        """Every number that affects the result, as JSON: those of the smooth spline and of the last stage."""
         return json.dumps(json.loads(self.smooth.text) | {"borders": {"skin": self.skin} | STAGE})
 
     @property
     def unlike_its_error_model(self) -> str:
-        """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
+        """Why the error model of this name is not valid, if it was made with other parameters."""
         return _unlike(self.name, self.smooth)
 
     def of_repeat(self) -> Self:
-        """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
+        """With the default weights: weights chosen for a pair without strain would smooth away the noise floor."""
         return replace(self, smooth=self.smooth.of_repeat(), skin=self.skin or USUAL_SKIN)
 
     def keeping_volume(self) -> Self:
-        """With the weight of tissue that keeps its volume, whatever the images ask for."""
+        """With the weight of incompressible tissue, whatever the images indicate."""
         return replace(self, smooth=self.smooth.keeping_volume())
 
     def record(self) -> dict[str, object]:
@@ -159,7 +160,7 @@ class GaussNewtonWithInterfaces(Engine):
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
         last = record.get("borders")
         smooth = GaussNewton.methods({**record, "borders": None}, versions)
         if not smooth or last is None:
@@ -167,14 +168,14 @@ class GaussNewtonWithInterfaces(Engine):
         skin, held = last.get("skin"), record.get("align") == "bone"
         weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
         return (
-            f"{smooth}; from there a second B-spline was added that vanishes on the "
-            "interfaces of the label map's tissues, which lets strain be discontinuous there, "
-            f"{'the bone held at rest and ' if held else ''}strain of a tissue called skin penalised (weight {weight})"
-            ", and bending counted by the Laplacian of both splines' Laplacian"
+            f"{smooth}; starting from this result, a second B-spline was added that vanishes on the tissue interfaces "
+            f"of the label map, so that strain can be discontinuous there, with {'a rigid bone, ' if held else ''}a "
+            f"penalty on the strain of a tissue named skin (weight {weight}), and bending measured by the Laplacian of "
+            "the Laplacian of both splines"
         )
 
     def prepare(self) -> None:
-        """Compile its loops, where no run has before."""
+        """Compile the loops, if no run has done so before."""
         compile_loops(lambda pair: fit_with_interfaces(pair, self.smooth))
 
     def find(
@@ -185,17 +186,19 @@ class GaussNewtonWithInterfaces(Engine):
         return Found(displacement, choice, self.unlike_study(pair, choice))
 
     def unlike_study(self, pair: AlignedPair, choice: Choice) -> str:
-        """Why its error model does not hold for a pair; empty where it does."""
+        """Why its error model is not valid for a pair; empty if it is."""
         if pair.bone is None:
-            return f"The error of {self.name} was measured with the bone held at rest; here no bone was aligned on."
+            return (
+                f"The error of {self.name} was measured with a rigid bone; here the images were not aligned on a bone."
+            )
         if choice.frees_volume or pair.labels is None:
             return _volume_freed(self.name, choice)
         share = float(np.mean(pair.labels.labels[pair.body.inside] == 0))
         if share <= _UNLABELLED:
             return ""
         return (
-            f"{share:.0%} of the body has no label: the error of {self.name} was measured on bodies of which every "
-            "tissue has one. Label it, or take one smooth spline (--no-borders)."
+            f"{share:.0%} of the body has no label, but the error of {self.name} was measured with every tissue "
+            "labelled. Label the whole body, or use one smooth spline (--no-borders)."
         )
 
 
@@ -221,8 +224,8 @@ def _unlike(name: str, used: Parameters) -> str:
     if used.bending is None:
         return f"The error of {name} was measured with other weights than these."
     return (
-        f"The error of {name} was measured with the weight of the bending chosen by its rule, as for a loaded image; "
-        f"here it was fixed at {used.bending:g}/mm, as for a repeat scan, or as you gave it."
+        f"The error of {name} was measured with the bending weight chosen by cross-validation. Here it was fixed at "
+        f"{used.bending:g}/mm, by your choice or because this is a repeat scan."
     )
 
 
@@ -230,6 +233,6 @@ def _volume_freed(name: str, choice: Choice) -> str:
     if not choice.frees_volume:
         return ""
     return (
-        f"The error of {name} was measured on phantoms that keep their volume; here the images ask for a change of "
-        "volume, which was allowed."
+        f"The error of {name} was measured on incompressible phantoms. Here incompressibility was relaxed, because the "
+        "images indicate a volume change."
     )

@@ -61,9 +61,9 @@ class Parameters:
     def __post_init__(self) -> None:
         check_fields(self)
         if not (np.isfinite(self.spacing_mm) and self.spacing_mm > 0):
-            raise ParameterError(f"Control points need a spacing above 0 mm; got {self.spacing_mm}.")
+            raise ParameterError(f"The control point spacing must be above 0 mm; got {self.spacing_mm}.")
         if self.bending is not None and not (np.isfinite(self.bending) and self.bending > 0):
-            raise ParameterError(f"The weight of the bending must be above 0; got {self.bending}.")
+            raise ParameterError(f"The weight 'bending' must be above 0; got {self.bending}.")
         for name in ("volume", "rigidity"):
             weight = getattr(self, name)
             if weight is not None and not (np.isfinite(weight) and weight >= 0):
@@ -163,13 +163,13 @@ def choose(
             best += way
         return best
 
-    rule = f"{name} by cross-validation: half of the voxels fitted, the other half's residual least"
+    rule = f"{name} chosen by cross-validation: fitted to half of the voxels, lowest residual in the other half"
     if margin is not None:
         best = followed(0, -1, 0.25 * margin)
         power = float(best)
         while power < greatest and left_out(int(power) + 1) <= (1.0 + margin) * min(found.values()):
             power += 1.0
-        rule += f", then raised for as long as that adds no more than {100.0 * margin:g} %"
+        rule += f", then increased as long as the residual rises by no more than {100.0 * margin:g} %"
     else:
         best = followed(0, 1) or followed(0, -1)
         power = float(best)
@@ -177,7 +177,7 @@ def choose(
             below, here, above = (left_out(best + d) for d in (-1, 0, 1))
             power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
         else:
-            rule += "; it is least at the end of what is tried"
+            rule += "; the lowest residual is at the end of the range tried"
     chosen = replace(weights, **{name: float(usual * _RATIO**power)})
     return Choice(
         chosen, rule, tuple((float(usual * _RATIO**p), found[p] / min(found.values())) for p in sorted(found))
@@ -201,7 +201,7 @@ def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:
     """Both images over the brightness of the tissue in the fixed one; InputError if that is not above zero."""
     scale = float(np.nanpercentile(pair.fixed.values[pair.body.inside], 75))
     if not scale > 0:
-        raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
+        raise InputError("The unloaded image is zero or negative in most of the tissue; intensities must be positive.")
     fixed, moving = (Image(image.grid, image.values / np.float32(scale)) for image in (pair.fixed, pair.moving))
     return fixed, moving
 
@@ -228,7 +228,7 @@ def spline_through(deformation: Deformation, control: Grid) -> FloatArray:
     u = deformation.displacement(control.points().reshape(-1, 3)).reshape(*control.shape, 3)
     unknown = ~np.isfinite(u).all(axis=-1)
     if unknown.all():
-        raise InputError("The deformation to start from is not defined anywhere in the unloaded image.")
+        raise InputError("The start deformation (start) is not defined anywhere in the unloaded image.")
     if unknown.any():
         to = distance_transform_edt(unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True)
         u = u[tuple(to)]

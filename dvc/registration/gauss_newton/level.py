@@ -103,7 +103,7 @@ class Level:
         F, cofactor, J, pulled = strained(self.pair.blocks.evaluate(coefficients)[1])
         images = self.pair.normal(coefficients, pulled, halves)
         if images.count == 0 or not np.isfinite(images.square) or (halves >= 0 and np.isnan(images.left_out)):
-            raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
+            raise RegistrationError("The registration diverged: the two images no longer overlap.")
         bent = self.roughness.product(coefficients)
         if self.rest is not None:
             bent -= self.roughness.held(self.rest)

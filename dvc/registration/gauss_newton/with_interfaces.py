@@ -73,7 +73,7 @@ def fit_with_interfaces(
     elif stage.slab_has_skin:
         in_skin = choose(stage.slab, coefficients, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
     else:
-        in_skin = Choice(weights, "rigidity as usual, as too little of it is in the image")
+        in_skin = Choice(weights, "rigidity at its default, because the image shows too little skin")
     progress(_SMOOTH_SHARE + 0.3)
     choice = Choice(in_skin.weights, "bending fixed beforehand")
     if parameters.bending is None:
@@ -96,7 +96,7 @@ class _Stage:
     def __init__(self, pair: AlignedPair, control: Grid, rest: FloatArray | None) -> None:
         labels, inside = pair.labels, pair.compared.inside
         if labels is None:
-            raise InputError("Strain can jump at tissue interfaces only where a label map tells the tissues.")
+            raise InputError("Strain discontinuities at tissue interfaces need a label map (labels).")
         self.interfaces = Interfaces.of(labels, pair.bone, float(control.spacing_mm.mean()), pair.body)
         soft = pair.body.inside & (self.interfaces.own != self.interfaces.rest)
         named = [number for number, name in labels.names.items() if name.lower() == _SKIN]

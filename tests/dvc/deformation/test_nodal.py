@@ -57,5 +57,5 @@ def test_a_displacement_for_every_node() -> None:
         OnMesh(MESH, np.zeros((4, 3)))
     broken = np.zeros_like(MESH.points_mm)
     broken[3, 1] = np.nan
-    with pytest.raises(InputError, match="1 of them not finite"):
+    with pytest.raises(InputError, match="1 values that are not finite"):
         OnMesh(MESH, broken)

@@ -41,7 +41,7 @@ def test_what_is_written_is_of_the_writers_kind(tmp_path: Path, kind: str, value
     made = {"image": IMAGE, "mask": MASK, "labels": LABELS}
     write = getattr(dvc, f"write_{kind}")
     for other in [value, *(thing for name, thing in made.items() if name != kind)]:
-        with pytest.raises(InputError, match=rf"^{kind} must be a dvc\.\w+: .*; got "):
+        with pytest.raises(InputError, match=rf"^{kind} must be a dvc\.\w+, .*; got "):
             write(tmp_path / "a.nii", other)
     with pytest.raises(InputError, match=rf"^path must be the path .*; got {type(made[kind]).__name__}"):
         write(made[kind], tmp_path / "a.nii")
@@ -77,7 +77,7 @@ def test_options_of_readers_are_of_their_kind(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=rf"^grid must be a dvc\.Grid, .*image\.grid.*; got ({told})"):
             dvc.fit_mask(MASK, grid)
     for mask in (ARRAY, path, IMAGE, None):
-        with pytest.raises(InputError, match=r"^mask_or_labels must be a dvc\.Mask: .*, or a dvc\.LabelMap: .*; got "):
+        with pytest.raises(InputError, match=r"^mask_or_labels must be a dvc\.Mask, .*, or a dvc\.LabelMap, .*; got "):
             dvc.fit_mask(mask, GRID)
     for names in (5, ["fat"], GRID):
         with pytest.raises(InputError, match=r"^names must be a dict, .*, or the path of .*; got "):

@@ -106,13 +106,13 @@ def test_what_is_written_is_read_again(measured, written):
     v, J = measured.deformation.evaluate(X)
     np.testing.assert_allclose(u, v, atol=1e-6)
     np.testing.assert_allclose(H, J, atol=1e-6)
-    with pytest.raises(InputError, match="copy that folder"):
+    with pytest.raises(InputError, match="Copy the folder"):
         again.write(written.parent / "copy")
 
 
 def test_what_a_twin_did_is_read_again(measured, tmp_path):
     rows = (Judged("fat", 0.02, 0.01, 0.9, 0.93, 1.2),)
-    bars = replace(measured.error_bars, twin=rows, of_twin="made wider by the twin of this pair: fat 1.2 times.")
+    bars = replace(measured.error_bars, twin=rows, of_twin="widened by the synthetic warp of this pair: fat 1.2 times.")
     replace(measured, error_bars=bars).write(tmp_path / "Load1")
     again = dvc.Measurement.read(tmp_path / "Load1").error_bars
     assert (again.twin, again.of_twin, again.told) == (rows, bars.of_twin, bars.told)
@@ -130,14 +130,14 @@ def test_a_deformation_from_elsewhere_is_a_measurement_too(stretched, tmp_path):
     assert dvc.Measurement.read(tmp_path / "stretched").image is None  # nothing lies there to show maps over
     for one in (again, dvc.Measurement.read(tmp_path / "stretched")):
         assert isinstance(one.plot(point_mm=GRID.points_at(np.array([7.0, 7.0, 9.0]))), Figure)
-    with pytest.raises(InputError, match="error of this measurement is not known"):
+    with pytest.raises(InputError, match="has no error bars"):
         stretched.plot("sigma")
 
 
 def test_labels_of_another_grid_are_refused_before_anything_is_registered(tiny_pair):
     labels = replace(tiny_pair.labels, grid=tiny_pair.labels.grid.moved_by(np.eye(3), np.ones(3)))
     settings = Settings(dvc.GaussNewton())  # which does not need them
-    with pytest.raises(GeometryError, match="labels lie on another grid"):
+    with pytest.raises(GeometryError, match="labels are on another grid"):
         dvc.measure(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.bone, labels=labels, settings=settings)
 
 
@@ -201,8 +201,8 @@ def test_colours_end_where_they_are_told_to_and_else_above_nearly_all(measured):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"quantity": "von Mises"}, "No quantity 'von Mises'; there are max_shear"),
-        ({"planes": ["oblique"]}, "Planes are among sagittal"),
+        ({"quantity": "von Mises"}, "Unknown quantity 'von Mises'; choose one of max_shear"),
+        ({"planes": ["oblique"]}, "Planes must be from sagittal"),
         ({"planes": []}, "got none"),
         ({"largest": -0.1}, "must be positive"),
     ],
@@ -224,11 +224,11 @@ def test_a_measurement_read_again_shows_the_same_slices(stretched, tmp_path):
     middle = replace(again, shown_mm=None).plot()
     assert [axes.get_title(loc="left") for axes in middle.axes[:3]] != titles[0]
     other = dvc.Grid(GRID.shape, GRID.spacing_mm, GRID.origin_mm + 1.0)
-    with pytest.raises(GeometryError, match="image lies on another grid"):
+    with pytest.raises(GeometryError, match="image is on another grid"):
         dvc.Measurement.read(tmp_path / "Load1", dvc.Image(other, stretched.image.values))
     (tmp_path / "Load2").mkdir()
     (tmp_path / "Load2" / files.QUALITY).write_text("{}")
-    with pytest.raises(InputError, match=r"holds Load1, Load2: read one of them, e\.g\. .*Load1\."):
+    with pytest.raises(InputError, match=r"several loads \(Load1, Load2\); read one, such as .*Load1\."):
         dvc.Measurement.read(tmp_path)
 
 

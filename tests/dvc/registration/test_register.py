@@ -180,7 +180,7 @@ def test_row_9_a_bone_along_which_fits_slide_is_not_located(along, noise):
         clean = gaussian_filter(np.where(shape, 100.0, 40.0), 0.7)
         return Image(grid, (clean + noise * random.normal(size=shape.shape)).astype(np.float32))
 
-    with pytest.raises(RegistrationError, match="the bone is not located"):
+    with pytest.raises(RegistrationError, match="the position of the bone is uncertain"):
         align(seen(rod), seen(rod), bone, "bone", 1)
     found = align(seen(rod | knob), seen(rod | knob), bone, "bone", 1)
     assert found.repeatability_mm < (0.4 if noise else 0.02)
@@ -199,7 +199,7 @@ def test_row_9_a_bone_whose_turning_nothing_shows_is_not_located(noise):
         return one, other, Mask(grid, radius < 14.0)
 
     for axes in ([1.0, 1.0, 1.0], [1.0, 1.0, 0.6]):
-        with pytest.raises(RegistrationError, match="the bone is not located"):
+        with pytest.raises(RegistrationError, match="the position of the bone is uncertain"):
             align(*pair(axes), "bone", 1)
     assert align(*pair([1.0, 1.6, 0.6]), "bone", 1).repeatability_mm < 0.2 * noise
 
@@ -207,7 +207,7 @@ def test_row_9_a_bone_whose_turning_nothing_shows_is_not_located(noise):
 def test_row_9_an_image_without_the_bone_is_refused(small_pair, worker):
     random = np.random.default_rng(5)
     noise = gaussian_filter(random.normal(size=small_pair.loaded.grid.shape), 2.0).astype(np.float32)
-    with pytest.raises(RegistrationError, match="nowhere does the loaded image look like it"):
+    with pytest.raises(RegistrationError, match="no position in the loaded image matches it"):
         register(
             small_pair.reference,
             Image(small_pair.loaded.grid, noise),
@@ -230,7 +230,7 @@ def test_row_27_without_alignment_too(settings, air_too, tiny_pair, worker):
     grid = loaded.grid.moved_by(back.rotation, back.translation_mm)
     inside = np.ones(grid.shape, dtype=bool) if air_too else tissue_mask(loaded).inside
     turned = Image(grid, np.where(inside, loaded.values.max() - loaded.values, loaded.values))
-    with pytest.raises(RegistrationError, match=r"below zero: .*AdvancedMattesMutualInformation"):
+    with pytest.raises(RegistrationError, match=r"correlate negatively .*AdvancedMattesMutualInformation"):
         register(tiny_pair.reference, turned, settings=replace(settings, align_on="none"), worker=worker)
 
 
@@ -247,7 +247,7 @@ def test_row_27_mutual_information_follows_turned_contrast(tiny_pair, worker):
 
 
 def test_row_8_identical_images_are_refused(tiny_pair):
-    with pytest.raises(InputError, match="every voxel is equal"):
+    with pytest.raises(InputError, match="all voxels are equal"):
         register(tiny_pair.reference, tiny_pair.reference, bone=tiny_pair.bone)
 
 
@@ -257,7 +257,7 @@ def test_the_bone_is_needed_to_align_on_it(tiny_pair):
 
 
 def test_a_rigid_transform_is_no_nonrigid_stage():
-    with pytest.raises(ParameterError, match="no B-spline"):
+    with pytest.raises(ParameterError, match="not a B-spline"):
         quick(Transform=("EulerTransform",))
 
 
@@ -290,7 +290,7 @@ def test_missing_voxels_are_left_out(tiny_pair, worker):
     ("given", "told"),
     [
         ({"engine": "gauss-newton"}, "Settings.of"),
-        ({"align_on": "bones"}, "bone, image"),
+        ({"align_on": "bones"}, "bone or image or none"),
         ({"threads": 0}, "1 or"),
     ],
 )
@@ -300,14 +300,14 @@ def test_settings_that_cannot_be_used_are_refused_when_they_are_made(given, told
 
 
 def test_an_engine_that_is_not_there_is_refused_with_those_that_are():
-    with pytest.raises(ParameterError, match="there are gauss-newton, gauss-newton-borders, heel-mr, or a parameter"):
+    with pytest.raises(ParameterError, match="use gauss-newton, gauss-newton-borders, heel-mr, or an elastix"):
         Settings.of("gauss")
 
 
 def test_stages_that_end_on_other_control_points_are_refused_first():
     preset = quick().engine.presets[0]
     other = replace(preset, parameters=preset.parameters | {"FinalGridSpacingInPhysicalUnits": ("5.0",)})
-    with pytest.raises(ParameterError, match="must be the same"):
+    with pytest.raises(ParameterError, match="must be equal"):
         Elastix((preset, other))
 
 

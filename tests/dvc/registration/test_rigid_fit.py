@@ -102,7 +102,7 @@ def test_what_the_loaded_image_does_not_show_is_left_out() -> None:
     assert off_mm(fit.whole(STILL), mask) < 0.02
     values[FINE.points()[..., 0] > CENTRE[0] - 4.0] = np.nan
     fit = RigidFit(seen(FINE, STILL), Image(FINE, values), mask, 1)
-    with pytest.raises(RegistrationError, match="leaves"):
+    with pytest.raises(RegistrationError, match="moved out of"):
         fit.whole(STILL)
 
 
@@ -112,7 +112,7 @@ def test_what_the_unloaded_image_does_not_show_is_left_out_too() -> None:
     values[FINE.points()[..., 1] > CENTRE[1] + 4.0] = np.nan
     fit = RigidFit(Image(FINE, values), seen(FINE, MOTION), mask, 1)
     assert off_mm(fit.whole(STILL), mask) < 0.02
-    with pytest.raises(InputError, match="shows 0 voxels of the mask"):
+    with pytest.raises(InputError, match="Only 0 voxels of the mask"):
         RigidFit(Image(FINE, np.full_like(values, np.nan)), seen(FINE, MOTION), mask, 1)
 
 
@@ -130,5 +130,5 @@ def test_a_mask_smaller_than_a_block_has_halves_too() -> None:
 
 def test_turned_contrast_is_refused() -> None:
     fit = RigidFit(seen(FINE, STILL), Image(FINE, -seen(FINE, MOTION).values), ball(FINE), 1)
-    with pytest.raises(RegistrationError, match="not brighter"):
+    with pytest.raises(RegistrationError, match="contrast of the loaded image is inverted"):
         fit.whole(MOTION)

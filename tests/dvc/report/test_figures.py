@@ -118,7 +118,7 @@ def test_view_is_cropped_to_the_mask_and_keeps_the_point(side: float) -> None:
     assert view.shown(mask).sum() == mask.sum()
     assert view.box[0].start <= view.index[0] < view.box[0].stop
     assert view.cut(mask, "axial").shape < (grid.shape[1], grid.shape[0])
-    with pytest.raises(GeometryError, match="outside the grid"):
+    with pytest.raises(GeometryError, match="outside the image"):
         View.through(grid, CENTRE + np.array([500.0, 0.0, 0.0]))
     with pytest.raises(GeometryError, match="cannot be shown"):
         view.cut(np.zeros((3, 3, 3)), "axial")

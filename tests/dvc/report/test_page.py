@@ -179,7 +179,7 @@ def test_one_load_needs_no_contents_and_none_is_possible(tmp_path: Path) -> None
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no PNG"):
+    with pytest.raises(InputError, match="not a PNG"):
         Picture("t", "c", b"GIF89a")
     with pytest.raises(InputError, match="Row 1"):
         Table("t", ("a", "b"), (("x", 1), ("y",)))

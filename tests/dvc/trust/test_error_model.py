@@ -64,7 +64,7 @@ def test_model_survives_its_file(tmp_path: Path) -> None:
 )
 def test_what_is_no_model_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "model.json").write_text(text)
-    with pytest.raises(InputError, match=r"model.json: no error model"):
+    with pytest.raises(InputError, match=r"model.json: not an error model"):
         read_error_model(tmp_path / "model.json")
 
 
@@ -81,7 +81,7 @@ def test_what_is_no_model_is_refused(tmp_path: Path, text: str) -> None:
 )
 def test_damaged_tables_are_refused_when_read(tmp_path: Path, change: dict) -> None:
     ErrorModel("heel-mr", "", (replace(TABLE, **change),), "made up").write(tmp_path / "model.json")
-    with pytest.raises(InputError, match="no error model"):
+    with pytest.raises(InputError, match="not an error model"):
         read_error_model(tmp_path / "model.json")
 
 

@@ -85,14 +85,14 @@ def test_lists_without_a_common_name_are_paired_in_order_and_this_is_logged(
 ) -> None:
     other = markups(tmp_path / "b.mrk.json", MOVED, "LPS", ("F-1", "F-2", "F-3"))
     check(read_landmarks((markups(tmp_path / "a.mrk.json", X, "LPS"), other)))
-    assert "share no name; their points are paired in order" in caplog.text
+    assert "have no point name in common; points are paired in the order listed" in caplog.text
 
 
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (("calcaneus", "sesamoid", "septum 5"), "in one file only: septum 4, septum 5"),
-        (("calcaneus", "sesamoid"), "holds 3 points and .* 2, .*in one file only: septum 4"),
+        (("calcaneus", "sesamoid", "septum 5"), "only in one file: septum 4, septum 5"),
+        (("calcaneus", "sesamoid"), r"\(3 points\) and .* \(2 points\) .*only in one file: septum 4"),
         (("calcaneus", "sesamoid", "sesamoid"), "repeated: sesamoid"),
     ],
 )
@@ -105,9 +105,9 @@ def test_lists_that_match_in_part_are_refused(tmp_path: Path, names: tuple[str, 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "column x0 is missing.*Found: nothing"),
-        ("x0,y0,z0,x1,y1\n1,2,3,4,5\n", "column z1 is missing.*Found: x0, y0"),
-        ("x0,y0,z0,x1,y1,z1\n", "no landmark"),
+        ("", "column x0 is missing.*it has: nothing"),
+        ("x0,y0,z0,x1,y1\n1,2,3,4,5\n", "column z1 is missing.*it has: x0, y0"),
+        ("x0,y0,z0,x1,y1,z1\n", "no landmarks below the header line"),
         ("x0,y0,z0,x1,y1,z1\n1,2,3,4,5,6\n1,2,3,4,5\n", r"pairs\.csv, line 3: z1 must be .* None"),
         ("x0,y0,z0,x1,y1,z1\n1,2,nan,4,5,6\n", "line 2: z0 must be a finite number"),
         ("x0;y0;z0;x1;y1;z1\n1;2;3;4;5;6\n", "column x0 is missing"),
@@ -122,13 +122,13 @@ def test_a_damaged_table_is_refused(tmp_path: Path, text: str, message: str) -> 
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"coordinateSystem": "IJK"}, "LPS or RAS, in mm; the file says IJK"),
-        ({"coordinateUnits": "m"}, "the file says LPS, m"),
-        ({"controlPoints": []}, "holds no point"),
+        ({"coordinateSystem": "IJK"}, "in mm, LPS or RAS; the file gives IJK"),
+        ({"coordinateUnits": "m"}, "the file gives LPS, m"),
+        ({"controlPoints": []}, "the list has no points"),
         ({"controlPoints": [{"label": "a", "position": [1, 2]}]}, "'a' has no position"),
         ({"controlPoints": [{"label": "a", "position": [1, 2, None]}]}, "'a': position must be"),
         ({"controlPoints": [{"label": "a", "positionStatus": "undefined"}]}, "'a' was never placed"),
-        ({"controlPoints": None}, "not a point list of Slicer"),
+        ({"controlPoints": None}, "not a Slicer file with one point list"),
     ],
 )
 def test_a_damaged_list_of_slicer_is_refused(tmp_path: Path, more: dict[str, object], message: str) -> None:
@@ -141,13 +141,13 @@ def test_what_tells_no_frame_or_is_another_kind_of_file_is_refused(tmp_path: Pat
     good = fcsv(tmp_path / "a.fcsv", X, "LPS")
     (tmp_path / "bare.fcsv").write_text("1,2,3,4\n")
     (tmp_path / "cut.mrk.json").write_text('{"markups": [')
-    with pytest.raises(ImageFileError, match="does not tell the frame"):
+    with pytest.raises(ImageFileError, match="lacks the frame"):
         read_landmarks((good, tmp_path / "bare.fcsv"))
-    with pytest.raises(ImageFileError, match="does not tell the frame"):
+    with pytest.raises(ImageFileError, match="lacks the frame"):
         read_landmarks((good, fcsv(tmp_path / "ijk.fcsv", X, "LPS", "IJK")))
-    with pytest.raises(ImageFileError, match="not a point list"):
+    with pytest.raises(ImageFileError, match="not a Slicer file"):
         read_landmarks((good, tmp_path / "cut.mrk.json"))
-    with pytest.raises(InputError, match=r"ends in \.mrk\.json or \.fcsv"):
+    with pytest.raises(InputError, match=r"must end in \.mrk\.json or \.fcsv"):
         read_landmarks((good, tmp_path / "points.txt"))
     with pytest.raises(InputError, match="two point lists"):
         read_landmarks(good)

@@ -48,7 +48,7 @@ def test_what_leaves_the_loaded_image_is_no_result_and_is_counted():
     assert quality.undefined_fraction == pytest.approx(share)
     assert 0.3 < share < 0.9
     assert quality.verdict.level == "distrust"
-    assert any("not shown by the loaded image" in reason for reason in quality.verdict.reasons)
+    assert any("the loaded image does not show it" in reason for reason in quality.verdict.reasons)
 
 
 def test_row_11_folding_is_found_with_its_place_and_not_trusted():
@@ -116,7 +116,7 @@ def test_what_noise_does_not_explain_costs_trust(lacks: float, with_more_noise: 
         similarity=Similarity((0.3, 0.5, 0.7), (0.7 + lacks, 0.7 + with_more_noise)),
     ).verdict  # fmt: skip
     assert verdict.level == level
-    assert all("same foot" in reason for reason in verdict.reasons)
+    assert all("the same subject" in reason for reason in verdict.reasons)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.2])
@@ -229,9 +229,9 @@ def test_a_registration_is_undefined_away_from_its_tissue():
 @pytest.mark.parametrize(
     ("p95", "says"),
     [
-        (0.06004, "0.06004 (95th percentile) where there is none (care above 0.06, distrust above 0.15)"),
-        (0.15002, "0.15002 (95th percentile)"),
-        (0.0712, "0.071 (95th percentile)"),
+        (0.06004, "0.06004 (95th percentile; use with care above 0.06, do not trust above 0.15)"),
+        (0.15002, "0.15002 (95th percentile;"),
+        (0.0712, "0.071 (95th percentile;"),
     ],
 )
 def test_a_figure_beyond_its_limit_does_not_read_as_if_it_were_the_limit(p95: float, says: str) -> None:
@@ -251,6 +251,6 @@ def test_a_fold_of_nearly_zero_is_not_called_minus_zero() -> None:
     jacobian[2, 2, 2] = -0.0004
     verdict = assess(replace(maps, jacobian=jacobian), WHOLE, None, similarity=ALIKE).verdict
     assert verdict.level == "distrust"
-    assert "lowest -0.0004 at" in verdict.reasons[0]
+    assert "lowest det F is -0.0004, at" in verdict.reasons[0]
     assert "-0.00 " not in " ".join(verdict.reasons)
     assert shown(-0.0) == "0"

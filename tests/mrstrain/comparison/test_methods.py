@@ -153,8 +153,8 @@ def test_borders_are_told(tmp_path: Path) -> None:
     record["parameters"] |= {"stages": [], "engine": "gauss-newton"} | GaussNewtonWithInterfaces().record()
     (place / "provenance.json").write_text(json.dumps(record))
     text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
-    assert "vanishes on the borders of the label map's tissues" in text
-    assert "strain of a tissue called skin penalised (weight chosen for each pair by cross-validation)" in text
+    assert "vanishes on the tissue interfaces of the label map" in text
+    assert "strain of a tissue named skin (weight chosen for each pair by cross-validation)" in text
 
 
 def test_a_twin_that_judged_the_error_bars_is_told(tmp_path: Path) -> None:
@@ -283,11 +283,11 @@ def test_what_the_engine_compares_and_holds_is_told(tmp_path: Path) -> None:
     assert gaussnewton._LEAST_VOXELS == elastix._LEAST_VOXELS == 2.0
     for align, bone in (("bone", True), ("image", False), ("none", False)):
         place = measured(tmp_path / align, "Load1", align)
-        assert "mm (every two voxels, if that is more)" in told({"Load1": place}, {})
+        assert "mm (or two voxels, if that is larger)" in told({"Load1": place}, {})
         record = json.loads((place / "provenance.json").read_text())
         record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton())}
         (place / "provenance.json").write_text(json.dumps(record))
         text = told({"Load1": place}, {})
         assert ("strain of the bone (1000/mm3)" in text) == bone
-        assert "3.2 mm (every two voxels, if that is more)" in text
+        assert "3.2 mm (or two voxels, if that is larger)" in text
         assert f"all voxels of the tissue and {nonrigid._MASK_MARGIN_MM:g} mm around it" in text

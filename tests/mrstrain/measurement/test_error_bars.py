@@ -86,7 +86,7 @@ def test_without_labels_all_but_bone_is_soft_tissue() -> None:
 @pytest.mark.parametrize(
     ("used", "labels", "bone", "says"),
     [
-        (model("heel-fine"), True, True, "heel-fine, and heel-mr was used"),
+        (model("heel-fine"), True, True, "for heel-fine, but the images were registered with heel-mr"),
         (model(voxel_mm=2.0), True, True, "too far"),
         (model(snr=100.0), True, True, "too far"),
         (model(text="(Edited 1)"), True, True, "other parameters"),
@@ -99,7 +99,7 @@ def test_where_the_error_is_not_known_the_reason_is_told(used: ErrorModel, label
     assert bars.uncertainty is None
     assert says in bars.told
     assert bars.as_dict() == {"known": False, "reason": bars.told}
-    assert bars.summary == [f"No error bars. {bars.told}"]
+    assert bars.summary == [f"No error bars: {bars.told}"]
     assert error_tables(bars) == []
 
 
@@ -138,7 +138,7 @@ def test_tissue_outside_the_mask_is_no_air() -> None:
 def test_several_stages_have_no_known_error() -> None:
     found, subject, maps = given()
     found.settings = Settings(Elastix((load_preset("heel-mr"), load_preset("heel-mr"))))
-    assert "several stages" in bars_of(found, subject, maps, model()).told
+    assert "several elastix stages" in bars_of(found, subject, maps, model()).told
 
 
 def test_a_preset_without_a_model_is_told() -> None:
@@ -153,13 +153,13 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     found.settings = Settings.of("gauss-newton")
     own = model("gauss-newton", text=found.settings.engine.text)
     assert bars_of(found, subject, maps, own).uncertainty is not None
-    assert "that of heel-mr" in bars_of(found, subject, maps, model()).told
+    assert "is for heel-mr" in bars_of(found, subject, maps, model()).told
     found.unlike_study = "This pair is unlike any phantom."
     assert bars_of(found, subject, maps, own).told == found.unlike_study
     found.settings = Settings(GaussNewton(bending=2.0))
     assert "fixed at 2/mm" in bars_of(found, subject, maps, own).told
     found.settings, found.unlike_study = Settings(GaussNewtonWithInterfaces()), ""
-    assert "gauss-newton-borders was used" in bars_of(found, subject, maps, own).told
+    assert "registered with gauss-newton-borders" in bars_of(found, subject, maps, own).told
     with_interfaces = model("gauss-newton-borders", text=found.settings.engine.text)
     assert bars_of(found, subject, maps, with_interfaces).uncertainty is not None
 
@@ -173,12 +173,12 @@ def test_an_error_model_is_for_pairs_like_those_of_its_study() -> None:
         (Choice(GaussNewton().weights, "", asked=asked) for asked in (0.01, 0.05)),
     )
     assert engine.unlike_study(pair, kept) == ""
-    assert "phantoms that keep their volume" in engine.unlike_study(pair, freed)
+    assert "incompressible phantoms" in engine.unlike_study(pair, freed)
     unlabelled = labels.labels.copy()
     unlabelled[12:20] = 0
     partly = replace(pair, labels=replace(labels, labels=unlabelled))
     assert "of the body has no label" in engine.unlike_study(partly, kept)
-    assert "with the bone held at rest" in engine.unlike_study(replace(partly, bone=None), freed)
+    assert "with a rigid bone" in engine.unlike_study(replace(partly, bone=None), freed)
 
 
 def twin_of(maps: StrainMaps, sd: float, bias: float = 0.03) -> TwinCheck:
@@ -203,15 +203,15 @@ def test_error_bars_that_hold_in_the_pairs_twin_stay_and_others_are_made_wider(s
     assert row.rms_error == pytest.approx(np.hypot(0.02, sd), rel=0.05)
     assert row.bias == pytest.approx(0.02, abs=0.002)
     assert bars.as_dict()["twin"][0]["factor"] == row.factor
-    assert error_tables(bars)[1].title.startswith("The twin")
+    assert error_tables(bars)[1].title.startswith("Check by a synthetic warp")
     if sd < 0.02:
         assert row.factor == 1.0
-        assert bars.of_twin == "they hold in the twin of this pair."
+        assert bars.of_twin == "confirmed by the synthetic warp of this pair."
         assert bars.uncertainty.intervals == alone.uncertainty.intervals
         assert np.isnan(bars.model.tables[0].widening)  # as it was: of one heel
         return
     assert row.factor == pytest.approx(np.sqrt((errors.ppf(0.95) / 1.96) ** 2 - 0.02**2) / 0.02, rel=0.02)
-    assert bars.of_twin.startswith("made wider by the twin of this pair: fat 1.")
+    assert bars.of_twin.startswith("widened by the synthetic warp of this pair: fat 1.")
     assert np.nanmax(bars.uncertainty.sigma) == pytest.approx(0.02 * row.factor, rel=1e-5)
     for now, before in zip(bars.uncertainty.intervals, alone.uncertainty.intervals, strict=True):
         assert now.estimate == before.estimate
@@ -219,7 +219,7 @@ def test_error_bars_that_hold_in_the_pairs_twin_stay_and_others_are_made_wider(s
         assert now.high >= before.high
     # what `compare` draws truths from is as sure as the least sure tissue, and says so
     assert bars.model.tables[0].widening == pytest.approx(row.factor)
-    assert "wider by the twin of one pair" in bars.model.source
+    assert "by the synthetic warp of one pair, and valid for that pair alone" in bars.model.source
     # judged again, the wider error bars hold
     again = twin_of(maps, sd, 0.02).max_shear - maps.max_shear
     inside = np.isfinite(again)
@@ -275,10 +275,11 @@ def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
     assert row.rms_error == pytest.approx(np.hypot(0.03, 0.05), rel=0.05)
     (table,) = error_tables(bars)
     assert table.columns == ("region", "error (rms)", "bias")
-    assert bars.of_twin.startswith("not known; the twin of this pair came back with an error (rms) of fat 0.05")
+    assert bars.of_twin.startswith("not known. In the synthetic warp of this pair, the error (rms)")
+    assert "is fat 0.05" in bars.of_twin
     failed = bars_of(found, subject, maps, model(), TwinCheck(None, "The deformation folds."))
     assert failed.twin == ()
-    assert failed.of_twin == "there is no twin of this pair. The deformation folds."
+    assert failed.of_twin.endswith("the synthetic warp of this pair has no result. The deformation folds.")
     assert failed.uncertainty is not None
 
 

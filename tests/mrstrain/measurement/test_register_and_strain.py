@@ -307,7 +307,7 @@ def test_row_17_an_output_that_cannot_be_a_folder_is_refused_first(study, tmp_pa
 
 
 def test_one_path_in_place_of_a_list_is_refused(study, tmp_path):
-    with pytest.raises(InputError, match="loads must be a list, with each the path of a file"):
+    with pytest.raises(InputError, match="loads must be a list, each item the path of a file"):
         register(study / "Load0.nii.gz", str(study / "Load1.nii.gz"), out=tmp_path / "out", bone=study / "bone.nii.gz")
 
 

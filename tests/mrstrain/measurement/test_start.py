@@ -84,7 +84,7 @@ def test_what_cannot_be_a_start_is_refused_first(small_pair, tmp_path):
         (one, {"start": tmp_path / "theirs.h5", "preset": "heel-mr"}, ParameterError, "^start is for the engine"),
         (one, {"start": tmp_path / "theirs.h5"}, InputError, "no such transform file"),
         (one, {"start": tmp_path / "theirs.h5", "start_frame": "RAS"}, InputError, "a transform file is in LPS"),
-        (one, {"start_frame": "RAS"}, ParameterError, "^start_frame is the frame of start, which is not given"),
+        (one, {"start_frame": "RAS"}, ParameterError, "^start_frame needs start, which is not given"),
     ):
         with pytest.raises(kind, match=said):
             register(tmp_path / "Load0.nii.gz", loads, out=tmp_path / "o", bone=tmp_path / "bone.nii.gz", **given)

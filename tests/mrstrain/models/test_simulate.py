@@ -236,7 +236,7 @@ def test_meshes_of_ansys_and_abaqus_give_what_the_same_mesh_gives_as_vtu(
     ("given", "said"),
     [
         (["--set", "trebi"], "the nearest is 'trebbi'"),
-        (["--set", "luboz", "--set", "luboz"], "--set: each only once"),
+        (["--set", "luboz", "--set", "luboz"], "--set: each name may occur only once"),
         (["--load", "Load1"], "A load is NAME=NORMAL"),
         (["--load", "../x=3"], "a name of letters"),
         (["--load", "a=1", "--load", "a=2"], "a name of its own"),

@@ -66,7 +66,7 @@ def test_a_rival_of_our_names_is_refused_wherever_it_lies(
     said = refusal([ROOT, theirs] if first == "ours" else [theirs, ROOT])
     assert f"The distribution {name}" in said
     assert title in said
-    assert f"package {package!r} has the name of one of mrstrain's" in said
+    assert f"package {package!r} has the same name as one of mrstrain" in said
     assert "environment of its own" in said
     assert ("is found in" in said) == (first == "theirs")
 
@@ -147,8 +147,8 @@ def test_what_is_missing_or_short_is_found_with_advice(tmp_path: Path, monkeypat
     for name, detail, advice in [
         ("numba", "not installed", "pip install numba"),
         ("itk-elastix", "0.23.0", "0.25."),
-        ("disk", "0.0 GiB free", "make room"),
-        ("memory", "4.0 GiB", "crop the images"),
+        ("disk", "0.0 GiB free", "Free disk space"),
+        ("memory", "4.0 GiB", "Crop the images"),
         ("Python", "Python 3", "3.11 or newer"),
         ("temporary folder", "read-only", "TMPDIR"),
     ]:

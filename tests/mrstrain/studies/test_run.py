@@ -108,7 +108,7 @@ def test_run_again_does_nothing_in_under_ten_seconds(done):
 def test_a_disk_with_too_little_room_is_refused_before_anything_is_made(done, images, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5 * 10**7))
     shutil.copytree(images, tmp_path / "study")
-    said = r"the results of 6 stages need about (\d+) MB and the disk has 50 MB left"
+    said = r"the results of 6 stages need about (\d+) MB, but the disk has only 50 MB left"
     with pytest.raises(OutputError, match=said) as refused:
         run(tmp_path / "study")
     assert not (tmp_path / "study" / "results" / "registration").exists()

@@ -76,12 +76,12 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     stamp = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "runs").iterdir()}
     study = accuracy(tmp_path, cases=cases, workers=1, tell_plan=plans.append)
     assert [p.split(", about")[0] for p in plans] == [
-        "2 registrations to do (0 are there already)",
-        "1 registrations to do (2 are there already)",
+        "2 registrations to run (0 are already done)",
+        "1 registrations to run (2 are already done)",
     ]
     # a smaller call adds nothing and takes nothing away
     again = accuracy(tmp_path, cases=cases[:1], workers=1, tell_plan=plans.append)
-    assert plans[-1].startswith("0 registrations to do (1 are there already)")
+    assert plans[-1].startswith("0 registrations to run (1 are already done)")
     assert repr(again.errors) == repr(study.errors)  # NaN, the ends of a bin that is none, equals nothing
     assert all((tmp_path / "runs" / name).stat().st_mtime_ns == t for name, t in stamp.items())
     assert not study.failures

@@ -131,13 +131,13 @@ def test_compressed_frames_are_decoded_and_scaled_by_their_own_slope(tmp_path: P
         np.testing.assert_array_equal(read_image(written).values, expected)
     refused(
         write_enhanced(tmp_path / "few.dcm", frames, change=lambda h: compress(h, 5), **size),
-        "claims 8 frames, the file holds 5",
+        "claims 8 frames, but the file has 5",
     )
     refused(
         write_enhanced(tmp_path / "size.dcm", frames, change=compress, **(size | {"Rows": 41})), "another size|decoded"
     )
     path.write_bytes(path.read_bytes()[:-300])
-    refused(path, "damaged|cut short")
+    refused(path, "damaged|incomplete")
 
 
 _PHASE = {"shows": ("ORIGINAL", "PRIMARY", "P", "NONE"), "component": "PHASE"}
@@ -160,7 +160,7 @@ def test_several_images_in_a_file_are_listed_and_chosen_from(tmp_path: Path, oth
     moved, other = other.get("at", 0.0), {name: value for name, value in other.items() if name != "at"}
     both = [g for k in SHUFFLED for g in (groups(k), groups(k, at=k + moved, scaling=("3", "0"), **other))]
     path = write_enhanced(tmp_path / "e" / "e.dcm", both)
-    message = refused(path, "the file holds several echoes, image types, orientations, stacks or time p", InputError)
+    message = refused(path, "the file has several echoes, image types, orientations, stacks or time p", InputError)
     lines = message.splitlines()[1:]
     assert [line.split(":")[0].strip() for line in lines] == ["111111/1", "111111/2"]
     assert "8 slices of 5 x 6" in lines[0]
@@ -169,8 +169,8 @@ def test_several_images_in_a_file_are_listed_and_chosen_from(tmp_path: Path, oth
     if "PlaneOrientationSequence" not in other:  # there the slices are sheared
         np.testing.assert_array_equal(read_image(path, series=f"111111/{own}").values, 3.0 * STORED)
     np.testing.assert_array_equal(read_image(path.parent, series=f"111111/{3 - own}").values, STORED)
-    refused(path, "fits 0 of the DICOM series", InputError, series="111111/3")
-    refused(path.parent, "the folder holds several", InputError)
+    refused(path, "matches 0 of the DICOM series", InputError, series="111111/3")
+    refused(path.parent, "the folder has several", InputError)
 
 
 def test_a_long_list_is_shortened_and_all_of_it_can_be_chosen(tmp_path: Path) -> None:
@@ -218,27 +218,29 @@ def test_an_image_in_several_files(tmp_path: Path) -> None:
     for k in range(SHAPE[2]):
         write_enhanced(single / f"{k * 5 % 7}{k}.dcm", [groups(k)])
     np.testing.assert_array_equal(read_image(single).values, STORED)
-    refused(single / "00.dcm", "Give its folder instead")
+    refused(single / "00.dcm", "Pass its folder instead")
     assert not is_multiframe(single / "00.dcm")
     parts = tmp_path / "parts"  # one image, stored in two files
     for name, held in (("b", SHUFFLED[:4]), ("a", SHUFFLED[4:])):
         frames = [groups(k) for k in held]
         write_enhanced(parts / f"{name}.dcm", frames, ConcatenationUID="1.2.9", InConcatenationTotalNumber=2)
     np.testing.assert_array_equal(read_image(parts).values, STORED)
-    refused(parts / "a.dcm", "Give its folder instead")
+    refused(parts / "a.dcm", "Pass its folder instead")
     (parts / "a.dcm").unlink()
-    refused(parts, "stored in 2 files, of which 1 are here")
+    refused(parts, "stored in 2 files, but only 1 are in this folder")
 
 
 def test_a_folder_with_a_file_for_each_time_point(tmp_path: Path) -> None:
     for t in (1, 2):
         write_enhanced(tmp_path / "e" / f"{t}.dcm", [groups(k, time=t) for k in SHUFFLED], offset=t)
-    message = refused(tmp_path / "e", "the folder holds several", InputError)
+    message = refused(tmp_path / "e", "the folder has several", InputError)
     assert re.findall(r"time point (\d)", message) == ["1", "2"]
     np.testing.assert_array_equal(read_image(tmp_path / "e", series="111111/2").values, STORED + 2.0)
     for t in (1, 2):
         write_enhanced(tmp_path / "e" / f"{t}.dcm", offset=t)
-    refused(tmp_path / "e", r"8 slices lie where another one does .*1\.dcm \(frame 2\).*Two acquisitions or copies")
+    refused(
+        tmp_path / "e", r"8 slices have the position of another slice .*1\.dcm \(frame 2\).*Two acquisitions or copies"
+    )
     np.testing.assert_array_equal(read_image(tmp_path / "e" / "2.dcm").values, STORED + 2.0)
 
 

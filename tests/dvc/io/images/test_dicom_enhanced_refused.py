@@ -37,25 +37,28 @@ def _cut(header: Any) -> None:
 _PLACED = [groups(k) for k in range(8)]
 _REFUSALS: dict[str, tuple[dict[str, Any], str]] = {
     "gap": ({"frames": [g for g in _PLACED if g.slice_shown != 4]}, r"1 gaps .*\(frame 4\) and .*\(frame 5\)"),
-    "twice": ({"frames": [*FRAMES, groups(4)]}, r"1 slices lie where .*frame 8\) and .*frame 9.*which frame belongs"),
+    "twice": (
+        {"frames": [*FRAMES, groups(4)]},
+        r"1 slices have the position .*frame 8\) and .*frame 9.*state the volume of each frame",
+    ),
     "uneven": ({"frames": [groups(k, at=k + 0.3 * (k == 4)) for k in range(8)]}, "not evenly stacked"),
-    "one group": ({"frames": [*FRAMES[:-1]], "NumberOfFrames": 8}, "claims 8 frames and describes 7"),
-    "no groups": ({"PerFrameFunctionalGroupsSequence": None}, "claims 8 frames and describes 0"),
-    "position": ({"frames": _without("PlanePositionSequence")}, "without ImagePositionPatient in .* of frame 1"),
-    "orientation": ({"change": _strip("PlaneOrientationSequence")}, "without ImageOrientationPatient in .* frame 1"),
-    "spacing": ({"change": _strip("PixelMeasuresSequence")}, "without PixelSpacing in the functional groups"),
-    "scaling": ({"frames": _without("PixelValueTransformationSequence", 0)}, "without RescaleSlope, .* of frame 2"),
+    "one group": ({"frames": [*FRAMES[:-1]], "NumberOfFrames": 8}, "claims 8 frames, but describes 7"),
+    "no groups": ({"PerFrameFunctionalGroupsSequence": None}, "claims 8 frames, but describes 0"),
+    "position": ({"frames": _without("PlanePositionSequence")}, "lacks ImagePositionPatient in .* of frame 1"),
+    "orientation": ({"change": _strip("PlaneOrientationSequence")}, "lacks ImageOrientationPatient in .* frame 1"),
+    "spacing": ({"change": _strip("PixelMeasuresSequence")}, "lacks PixelSpacing in the functional groups"),
+    "scaling": ({"frames": _without("PixelValueTransformationSequence", 0)}, "lacks RescaleSlope, .* of frame 2"),
     "slope": ({"frames": [*FRAMES[:-1], groups(4, scaling=("1e999", "0"))]}, "frame 8: .*not finite"),
     "no width": (
         {"frames": [groups(k, PixelMeasuresSequence=item(PixelSpacing=["0", "1"])) for k in range(8)]},
         "5 x 6 voxels of 1 x 0 mm; all must be positive",
     ),
-    "pixels": ({"change": _cut}, "cut short: 8 frames of 5 x 6 voxels need 480 bytes, it holds 460"),
-    "no pixels": ({"change": lambda header: delattr(header, "PixelData")}, "without pixels"),
+    "pixels": ({"change": _cut}, "incomplete: 8 frames of 5 x 6 voxels need 480 bytes, but it has 460"),
+    "no pixels": ({"change": lambda header: delattr(header, "PixelData")}, "has no pixels"),
     "terabytes": ({"Rows": 65535, "Columns": 65535}, "65535 x 65535 x 8 voxels, about 128.0 GiB"),
-    "frames": ({"NumberOfFrames": 2**31 - 1}, "claims 2147483647 frames and describes 8"),
+    "frames": ({"NumberOfFrames": 2**31 - 1}, "claims 2147483647 frames, but describes 8"),
     "colour": ({"PhotometricInterpretation": "RGB", "SamplesPerPixel": 3}, "in colour"),
-    "mask": ({"SOPClassUID": SegmentationStorage}, "of a kind that is not read.*dcm2niix"),
+    "mask": ({"SOPClassUID": SegmentationStorage}, "only enhanced MR and CT images.*dcm2niix"),
     "one": ({"frames": [groups(0), groups(1, stack="2")]}, "a single slice|at least 4 slices"),
 }
 
@@ -82,7 +85,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, syntax: Any) -> None:
     whole = write_enhanced(tmp_path / "e.dcm", syntax=syntax).read_bytes()
     for kept in np.linspace(0, len(whole) - 12, 60).astype(int):
         (tmp_path / "e.dcm").write_bytes(whole[:kept])
-        refused(tmp_path / "e.dcm", "damaged|cut short")
+        refused(tmp_path / "e.dcm", "damaged|incomplete")
 
 
 @pytest.mark.parametrize("enhanced", [True, False], ids=["enhanced", "classic"])
@@ -112,7 +115,7 @@ def test_a_file_cut_within_its_first_elements_is_not_left_out(tmp_path: Path) ->
     whole = (write_classic(tmp_path / "s", [("1", "0")] * 8) / "7.dcm").read_bytes()  # the last in space: no gap
     for kept in (140, 175, 300, 345, 360):
         (tmp_path / "s" / "7.dcm").write_bytes(whole[:kept])
-        refused(tmp_path / "s", r"7\.dcm: .*(damaged|cut short)")
+        refused(tmp_path / "s", r"7\.dcm: .*(damaged|incomplete)")
 
 
 def test_what_a_header_holds_by_mistake_is_not_quoted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -55,7 +55,7 @@ def _qform(affine: np.ndarray) -> Callable[[Any], None]:
 def test_qform_and_sform_that_disagree_are_refused(tmp_path: Path) -> None:
     turned = _AFFINE.copy()
     turned[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix() @ _AFFINE[:3, :3]
-    with pytest.raises(ImageFileError, match="qform and sform place the image's corners"):
+    with pytest.raises(ImageFileError, match="qform and sform differ: they place the image corners"):
         read_image(_save(tmp_path / "a.nii", _qform(turned)))
 
 
@@ -87,7 +87,7 @@ def test_one_orientation_with_the_other_switched_off_is_enough(tmp_path: Path, u
 
 
 def test_no_orientation_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ImageFileError, match="does not say how the image lies in space"):
+    with pytest.raises(ImageFileError, match="the header has no orientation"):
         read_image(_save(tmp_path / "a.nii", _sets(qform_code=0, sform_code=0)))
 
 
@@ -158,7 +158,7 @@ def test_other_units_are_converted_and_told(
 def test_unknown_units_are_taken_as_mm_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     image = read_image(_save(tmp_path / "a.nii", _sets(xyzt_units=0)))
     np.testing.assert_allclose(image.grid.spacing_mm, [1.5, 1.0, 2.5])
-    assert "taken as mm" in caplog.text
+    assert "mm is assumed" in caplog.text
 
 
 def test_mm_are_nothing_to_tell(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -177,7 +177,7 @@ def test_units_that_do_not_exist_are_refused(tmp_path: Path, code: int) -> None:
 def test_a_volume_of_a_4d_file(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     series = np.random.default_rng(1).normal(size=(5, 6, 7, 3)).astype(np.float32)
     path = _save(tmp_path / name, values=series)
-    with pytest.raises(ImageFileError, match=r"holds 3 volumes.* with N from 0 to 2") as caught:
+    with pytest.raises(ImageFileError, match=r"has 3 volumes.* with N from 0 to 2") as caught:
         read_image(path)
     command = re.search(r"dvc\.write_image\(.*\)\)", str(caught.value))
     assert command is not None
@@ -187,12 +187,12 @@ def test_a_volume_of_a_4d_file(tmp_path: Path, name: str, monkeypatch: pytest.Mo
     for volume in range(3):
         np.testing.assert_array_equal(read_image(path, volume=volume).values, series[..., volume])
     for volume in (-1, 3):
-        with pytest.raises(ImageFileError, match=rf"volume={volume} was asked for"):
+        with pytest.raises(ImageFileError, match=rf"volume={volume} does not exist"):
             read_image(path, volume=volume)
     # the first volume of a file whose last one is cut short is not trusted either
     content = path.read_bytes()
     path.write_bytes(content[:-50])
-    with pytest.raises(ImageFileError, match="cut short"):
+    with pytest.raises(ImageFileError, match="incomplete"):
         read_image(path, volume=0)
 
 
@@ -217,7 +217,7 @@ def test_a_header_that_claims_terabytes_is_refused_with_the_estimate(tmp_path: P
 
 def test_a_header_that_claims_gigabytes_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
     path = _save(tmp_path / "a.nii.gz", lambda header: header["dim"].__setitem__(slice(1, 4), [1500, 1500, 1500]))
-    with pytest.raises(ImageFileError, match="cut short"):
+    with pytest.raises(ImageFileError, match="incomplete"):
         read_image(path)
 
 

@@ -115,7 +115,7 @@ class TestRefusedValues:
 
     def test_constant(self, tmp_path: Path, suffix: str) -> None:
         path = self._save(tmp_path, suffix, np.full((5, 5, 5), 7.0, np.float32))
-        with pytest.raises(ImageFileError, match=r"constant image \(every voxel is 7\)"):
+        with pytest.raises(ImageFileError, match=r"constant \(all voxels are 7\)"):
             read_image(path)
 
     @pytest.mark.parametrize("shape", [(8, 8), (8, 8, 1), (8, 8, 3)])
@@ -170,7 +170,7 @@ def test_a_file_cut_short_is_refused(tmp_path: Path, suffix: str, kept: float) -
 def test_a_whole_stream_of_too_few_voxels_is_refused(tmp_path: Path) -> None:
     path = _written(tmp_path / "a.nii.gz", _grid(np.eye(3)))
     path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes())[:-4]))
-    with pytest.raises(ImageFileError, match=r"cut short: the header needs 1864 bytes .* holds 1860"):
+    with pytest.raises(ImageFileError, match=r"incomplete: the header needs 1864 bytes .* has 1860"):
         read_image(path)
 
 
@@ -180,7 +180,7 @@ def test_damaged_compressed_voxels_are_refused(tmp_path: Path, suffix: str) -> N
     content = bytearray(path.read_bytes())
     content[-30] ^= 0xFF
     path.write_bytes(bytes(content))
-    with pytest.raises(ImageFileError, match=r"damaged|cut short"):
+    with pytest.raises(ImageFileError, match=r"damaged|incomplete"):
         read_image(path)
 
 
@@ -202,14 +202,14 @@ def test_voxels_beyond_the_header_are_refused(tmp_path: Path, suffix: str) -> No
         path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()) + bytes(9999)))
     else:
         path.write_bytes(path.read_bytes() + bytes(9999))
-    with pytest.raises(ImageFileError, match="do not belong together"):
+    with pytest.raises(ImageFileError, match="do not match"):
         read_image(path)
 
 
 def test_unknown_kinds_of_file_are_refused_with_a_list(tmp_path: Path) -> None:
     for name in ("a.gipl", "a.vtk", "a.png", "a.img", "a"):
         (tmp_path / name).write_bytes(b"x" * 200)
-        with pytest.raises(ImageFileError, match=r"What is read: \.nii, \.nii\.gz, .*DICOM"):
+        with pytest.raises(ImageFileError, match=r"Supported: \.nii, \.nii\.gz, .*DICOM"):
             read_image(tmp_path / name)
     with pytest.raises(InputError, match="no such file"):
         read_image(tmp_path / "missing.nii")
@@ -217,11 +217,11 @@ def test_unknown_kinds_of_file_are_refused_with_a_list(tmp_path: Path) -> None:
 
 def test_options_that_do_not_fit_the_file_are_refused(tmp_path: Path) -> None:
     path = _written(tmp_path / "a.nrrd", _grid(np.eye(3)))
-    with pytest.raises(InputError, match="for DICOM folders"):
+    with pytest.raises(InputError, match="for DICOM files and folders"):
         read_image(path, series="123")
     with pytest.raises(InputError, match="for 4D files"):
         read_image(tmp_path, volume=1)
-    with pytest.raises(ImageFileError, match="volume=1 was asked for"):
+    with pytest.raises(ImageFileError, match="volume=1 does not exist"):
         read_image(path, volume=1)
 
 
@@ -263,5 +263,5 @@ def test_real_files_agree_with_simpleitk(
 
 
 def test_a_real_4d_file_is_refused_with_its_number_of_volumes(real_data: Path) -> None:
-    with pytest.raises(ImageFileError, match=r"holds 2 volumes; one is needed.*volume=N.* with N from 0 to 1"):
+    with pytest.raises(ImageFileError, match=r"has 2 volumes, but one is needed.*volume=N.* with N from 0 to 1"):
         read_image(real_data / "brain-pair" / "example4d.nii.gz")

@@ -186,18 +186,18 @@ def test_what_cannot_be_a_mesh_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("*HEADING", "*INCLUDE, INPUT=nodes.inp", r"\*INCLUDE in line 1 brings in"),
+        ("*HEADING", "*INCLUDE, INPUT=nodes.inp", r"\*INCLUDE in line 1 includes"),
         ("*HEADING", "*PART, NAME=a\n*END PART\n*PART, NAME=b", r"\*PART in line 3 is a second part"),
         ("*HEADING", "*INSTANCE, NAME=a, PART=b\n0., 0., 12.", r"\*INSTANCE in line 1 moves the part"),
         ("*NODE, NSET=N1", "*NODE, SYSTEM=C", "cylindrical"),
-        ("type=C3D4H", "type=C3D27", "solid elements of type C3D27 are not read"),
-        ("type=C3D4H", "type=C3D10", "need 11 numbers each; the 100 numbers"),
+        ("type=C3D4H", "type=C3D27", "solid elements of type C3D27 are not supported"),
+        ("type=C3D4H", "type=C3D10", "need 11 numbers each, but 100 is not"),
         ("\n48, ", "\n47, ", "element 47 is defined twice"),
         ("*Node\n", f"*Node\n{TAGS[0]}, 0, 0, 0\n", f"node {TAGS[0]} is defined twice"),
-        ("*Node\n", "*Node\nfour, 0, 0, 0\n", "could not be read .*'four'"),
+        ("*Node\n", "*Node\nfour, 0, 0, 0\n", "cannot be read .*'four'"),
         ("PART ONE", "PART TWO", "'PART TWO' is not defined"),
         ("PART ONE", "Skin", "'Skin' is not defined, or contains itself"),
-        ("\n21, ", f"\n21, {TAGS[0] + 1}, {TAGS[1]}, 1, 1\n99, ", "which the file does not define"),
+        ("\n21, ", f"\n21, {TAGS[0] + 1}, {TAGS[1]}, 1, 1\n99, ", "which is not defined in the file"),
     ],
 )
 def test_what_is_not_read_in_an_abaqus_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -216,11 +216,11 @@ def row(*numbers: int) -> str:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("(3i9,6e21.13e3)", "(3i9,6f21.13e3)", r"a row of NBLOCK could not be read"),
-        ("(3i9,6e21.13e3)", "(3i0,6e21.13e3)", r"a row of NBLOCK could not be read .*'\(3i0,6e21.13e3\)' is no format"),
-        ("(19i9)", "(19i0)", r"a row of EBLOCK could not be read .*'\(19i0\)' is no format"),
-        ("(8i10)", "(8i0)", r"a row of CMBLOCK could not be read"),
-        (row(4, 0, 1), row(3, 0, 1), r"element 1 has 3 nodes; a tetra has 4"),
+        ("(3i9,6e21.13e3)", "(3i9,6f21.13e3)", r"a row of NBLOCK cannot be read"),
+        ("(3i9,6e21.13e3)", "(3i0,6e21.13e3)", r"a row of NBLOCK cannot be read .*'\(3i0,6e21.13e3\)' is not a format"),
+        ("(19i9)", "(19i0)", r"a row of EBLOCK cannot be read .*'\(19i0\)' is not a format"),
+        ("(8i10)", "(8i0)", r"a row of CMBLOCK cannot be read"),
+        (row(4, 0, 1), row(3, 0, 1), r"element 1 has 3 nodes, but a tetra needs 4"),
         (row(4, 0, 2), row(4, 0, 1), r"element 1 is defined twice"),
         (f"{TAGS[1]:9d}{0:9d}{0:9d}", f"{TAGS[0]:9d}{0:9d}{0:9d}", f"node {TAGS[0]} is defined twice"),
     ],
@@ -321,11 +321,11 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing_behind(tmp_path: P
         write_on_mesh(mesh.path, mesh, {}, {})
     with pytest.raises(InputError, match=r"must end in \.csv"):
         write_nodal_displacements(tmp_path / "bc.txt", mesh, u)
-    with pytest.raises(InputError, match=r"each of the 50 cells.* got shape \(48,\)"):
+    with pytest.raises(InputError, match=r"50 rows, one per cell, .* got shape \(48,\)"):
         write_on_mesh(tmp_path / "out.vtu", mesh, {}, {"J": np.ones(48)})
     with pytest.raises(InputError, match=r"shape \(27, 3\).* got \(26, 3\)"):
         write_nodal_displacements(tmp_path / "bc.csv", mesh, u[1:])
-    with pytest.raises(InputError, match="'node' is kept"):
+    with pytest.raises(InputError, match="'node' is reserved"):
         write_on_mesh(tmp_path / "out.vtu", mesh, {"node": u}, {})
     with pytest.raises(OutputError, match="folder exists"):
         write_on_mesh(tmp_path / "nowhere" / "out.vtu", mesh, {}, {})

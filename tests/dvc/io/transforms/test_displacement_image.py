@@ -101,7 +101,7 @@ def test_refuses_other_images(tmp_path: Path) -> None:
     image = nibabel.Nifti1Image(np.zeros((4, 5, 6, 1, 3), np.float32), np.eye(4))
     image.header.set_xyzt_units("meter")
     nibabel.save(image, tmp_path / "metres.nii")
-    with pytest.raises(ImageFileError, match="lengths in metres"):
+    with pytest.raises(ImageFileError, match="lengths are in metres"):
         read_displacement(tmp_path / "metres.nii", frame="LPS")
     image = nibabel.Nifti1Image(np.zeros((4, 5, 6, 1, 3), np.float32), np.eye(4))
     image.set_qform(np.diag([-1.0, -1.0, 1.0, 1.0]), code=1)
@@ -112,7 +112,7 @@ def test_refuses_other_images(tmp_path: Path) -> None:
     grid = Grid((4, 5, 6), (1.0, 1.5, 2.0), (10.0, -20.0, 30.0))
     write_with_sitk(tmp_path / "cm.mha", grid, vectors(grid))
     (tmp_path / "cm.json").write_text('{"frame": "LPS", "unit": "cm"}')
-    with pytest.raises(ImageFileError, match="in mm on the reference"):
+    with pytest.raises(ImageFileError, match="in mm in the reference"):
         read_displacement(tmp_path / "cm.mha")
 
 
@@ -166,8 +166,8 @@ def written(
 @pytest.mark.parametrize(
     ("damage", "cause"),
     [
-        (lambda content: content[: int(len(content) * 0.6)], "cut short"),
-        (lambda content: content[:-4], "cut short|have no end"),
+        (lambda content: content[: int(len(content) * 0.6)], "incomplete"),
+        (lambda content: content[:-4], "incomplete|have no end"),
         (lambda content: flipped(content, len(content) // 2), "compressed voxels are damaged"),
         (lambda content: flipped(content, -4 if b"MET_FLOAT" in content else -8), "damaged"),  # zlib, gzip
     ],
@@ -234,7 +234,7 @@ def test_refuses_a_sheared_affine(tmp_path: Path, suffix: str, change: Callable[
 def test_refuses_other_units_than_mm(tmp_path: Path, suffix: str, change: Callable[[bytes], bytes]) -> None:
     # Lengths of an image are converted; whether the components are in the header's unit, no header says.
     path = written(tmp_path, suffix, change)
-    with pytest.raises(ImageFileError, match=r"lengths in .* a displacement in mm is needed"):
+    with pytest.raises(ImageFileError, match=r"lengths are in .* a displacement in mm is needed"):
         read_displacement(path, frame="LPS")
 
 

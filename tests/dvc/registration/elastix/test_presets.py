@@ -32,7 +32,7 @@ def test_an_unknown_preset_is_refused_with_the_known_ones():
 def test_row_10_a_misspelt_parameter_is_refused_with_the_nearest_known(tmp_path, line, nearest):
     path = tmp_path / "mine.txt"
     path.write_text(GOOD + line)
-    with pytest.raises(ParameterError, match=rf"mine\.txt: .*nearest that it knows is '{nearest}'"):
+    with pytest.raises(ParameterError, match=rf"mine\.txt: .*closest known name is '{nearest}'"):
         read_parameter_file(path)
     assert read_parameter_file(path, allow_unknown=True).parameters["Transform"] == ("BSplineTransform",)
 
