@@ -101,6 +101,37 @@ def test_tangent_is_the_derivative_of_the_residual(name: str, pressed: float) ->
 
 
 @pytest.mark.parametrize("name", ELEMENTS)
+def test_a_node_that_moves_and_follows_others_changes_what_a_whole_evaluation_would(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the cells around it are evaluated, and folded cells leave nothing behind."""
+    model = model_of(name, count=4)
+    nodes = model.space.nodes_mm
+    left, right = (np.flatnonzero(np.isclose(nodes[:, 0], x)) for x in (0.0, 8.0))
+    built = (model, unknowns(left, 0, 1, 2), {k: unknowns(right, k) for k in range(3)})
+    assembler, evaluated, run = Assembler(*built), [], Assembler._in_chunks
+    monkeypatch.setattr(Assembler, "_in_chunks", lambda *given, **how: evaluated.append(given[2]) or run(*given, **how))
+    state = np.random.default_rng(0).normal(0.0, 0.01, model.unknowns)
+    assembler.residual(state, ahead=True)
+    for count, move in ((1, 0.05), (2, -0.05), (3, -50.0), (2, 0.1)):
+        followers = {k: unknowns(right[:count], k) for k in range(3)}
+        state[unknowns(right[:count], 0)] += move
+        fresh = Assembler(*built)
+        fresh.share(followers)
+        expected = *fresh.residual(state), fresh.tangent(state)
+        evaluated.clear()
+        assembler.share(followers)
+        found = *assembler.residual(state, ahead=True), assembler.tangent(state)
+        for one, other in zip(found, expected, strict=True):
+            assert one == pytest.approx(other, rel=1e-12, abs=1e-12 * np.nanmax(np.abs(other)), nan_ok=True)
+        assert (evaluated[0] is None) == (count == 2 and move > 0.0)  # after folded cells all are evaluated
+        assert evaluated[0] is None or len(evaluated[0]) < 0.2 * len(model.space.cells)
+        if move < -1.0:
+            assert not found[2] > 0.0
+        state[unknowns(right[:count], 0)] -= move * (move < -1.0)
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
 def test_patch(name: str) -> None:
     """A uniform deformation of one tissue, its border moved accordingly, is found exactly on a crooked mesh."""
     model = model_of(name, layers=1)
