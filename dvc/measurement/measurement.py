@@ -289,13 +289,16 @@ class Measurement:
     def section(self, pictures: Mapping[str, Picture]) -> Section:
         """Its part of a report."""
         found, bars = None if self.source is None else self.source.registration, self.error_bars
-        tables = [page.key_figures(self.quality, self.alignment), page.region_table(self.regions)]
+        notes = " ".join(filter(None, ["" if found is None else found.settings.engine.note, *bars.summary]))
+        tables = [replace(page.key_figures(self.quality, self.alignment), note=notes), page.region_table(self.regions)]
         tables += [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
         tables += page.error_tables(bars)
-        notes = ["" if found is None else found.settings.engine.note, *bars.summary]
+        first = [pictures[stem] for stem in ("strain", "curves")]
+        others = [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
         short = page.summary_table(self.regions, self.intervals)
-        texts, drawn = tuple(filter(None, notes)), tuple(pictures.values())
-        return Section(self.name, self.verdict, tuple(tables), drawn, texts, summary=short)
+        return Section(
+            self.name, self.verdict, tuple(tables), (*first, *others), pictures_first=True, summary=short
+        )  # fmt: skip
 
     def pictures(self) -> dict[str, Picture]:
         """The figures of a report, by the name of their file; InputError for one that was read from a folder."""

@@ -1,12 +1,14 @@
 """Pictures and tables of a measurement in a report."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import StrainMaps
+from dvc.images.image import Image
 from dvc.measurement.error_bars import ErrorBars
 from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
@@ -46,7 +48,12 @@ def pictures_of(
         drawn["similarity"] = Picture.drawn("Local similarity of the images", figures.similarity_slices, *local)
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
     through = "Slices through the lowest point of the bone along the plate normal."
-    drawn["strain"] = Picture.drawn("Maximum shear strain", figures.strain_slices, *strain, note=through)
+    picture = Picture.drawn("Maximum shear strain", figures.strain_slices, *strain, note=through)
+    if images is not None:
+        both = {"unloaded": reference, "loaded, registered": Image(reference.grid, images.registered)}
+        beneath = tuple((name, figures.image_slices(view, image)) for name, image in both.items())
+        picture = replace(picture, beneath=beneath)
+    drawn["strain"] = picture
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
     drawn["curves"] = Picture.drawn("Strain-volume curves", figures.shear_curves, *curves)
     grid = view, below, maps.displacement_mm, None if bone is None else bone.inside

@@ -108,6 +108,14 @@ def strain_slices(
     return coloured(view, reference, max_shear, Scale.of("max_shear", max_shear, largest), outline=outline).png()
 
 
+def image_slices(view: View, image: Image) -> bytes:
+    """An MR image in grey, on a page of the size of `strain_slices`."""
+    sheet, window = Sheet(view, [""], bar=True), window_of(view, image.values)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, image.values, window)
+    return sheet.png()
+
+
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
     """Standard deviation of the maximum shear strain in colour over the unloaded image, from the error model.
 

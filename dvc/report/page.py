@@ -43,11 +43,15 @@ METHODS = "Methods text"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A PNG figure (InputError for another) with what it shows and how to read it."""
+    """A PNG figure (InputError for another) with what it shows and how to read it.
+
+    A page fades from it to pictures ``beneath`` it, of the same size, each a name with a PNG file's bytes.
+    """
 
     title: str
     caption: str
     png: bytes
+    beneath: tuple[tuple[str, bytes], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.png.startswith(_PNG_SIGNATURE):
@@ -67,6 +71,11 @@ class Picture:
     def small(self) -> str:
         """The picture for an ``img`` element as WebP, in a third of the room."""
         return _small(self.png)
+
+    @property
+    def small_beneath(self) -> list[tuple[str, str]]:
+        """The pictures beneath it, each with its name; as `small`."""
+        return [(name, _small(png)) for name, png in self.beneath]
 
     @property
     def width(self) -> int:
@@ -148,7 +157,7 @@ class Section:
     viewers: tuple[Viewer, ...] = ()
     folded: bool = False
     pictures_first: bool = False  # before the tables
-    summary: Table | None = None  # for the first part of a report of many sections
+    summary: Table | None = None  # its first table, which a report of many sections also begins with
 
 
 def shown(value: Cell) -> str:

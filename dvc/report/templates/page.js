@@ -9,3 +9,10 @@ document.querySelectorAll("nav a").forEach((link) => link.addEventListener("clic
   document.querySelector(link.getAttribute("href")).open = true;
 }));
 unfolded();
+/* Pictures on top of one another fade. */
+document.querySelectorAll(".faders").forEach((faders) => {
+  const over = faders.previousElementSibling.querySelectorAll(".over");
+  faders.querySelectorAll("input").forEach((fader, number) => fader.addEventListener("input", () => {
+    over[number].style.opacity = fader.value / 100;
+  }));
+});

@@ -43,7 +43,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
-        if tag not in {"meta", "img"}:
+        if tag not in {"meta", "img", "input"}:
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
@@ -186,3 +186,16 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="nowhere"):
         write_report(tmp_path / "nowhere" / "r.html", "t", TRUST, [], [], {})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_fades_to_those_beneath_it(tmp_path: Path) -> None:
+    below = ("unloaded", png()), ("loaded, registered", png())
+    pictures = (Picture("Strain", "c", png(), below), Picture("Curves", "c", png()))
+    write_report(tmp_path / "r.html", "A heel", None, [Section("Load1", pictures=pictures)], [], {})
+    page = Page((tmp_path / "r.html").read_text())
+    images = [(a["alt"], a.get("class"), a.get("style")) for a in page.all("img")]
+    assert images == [
+        ("unloaded, Load1", None, None), ("loaded, registered, Load1", "over", "opacity: 0"),
+        ("Strain, Load1", "over", None), ("Curves, Load1", None, None),
+    ]  # fmt: skip
+    assert [(a["type"], a["value"]) for a in page.all("input")] == [("range", "0"), ("range", "100")]
