@@ -226,7 +226,7 @@ def test_the_twin_of_a_pair_is_measured_again_and_told(tiny_pair, tmp_path):
         progress=lambda case, stage, _: stages.append((case, stage)),
     )  # fmt: skip
     assert not results.failures
-    assert ("Load1", "making the twin") in stages
+    assert ("Load1", "making the synthetic warp") in stages
     quality = json.loads((tmp_path / "out" / "Load1" / "quality.json").read_text())
     (row,) = quality["error_of_max_shear"]["twin"]
     shear = read_image(tmp_path / "out" / "Load1" / "max_shear.nii.gz", allow_missing=True).values
