@@ -18,6 +18,7 @@ from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values
 
 _CHUNK = 4096  # cells whose matrices are in memory at once
+_FEW = 0.1  # share of the unknowns up to which it is quicker to evaluate the cells around them twice than all once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +27,7 @@ class _Evaluated:
 
     state: FloatArray
     forces: FloatArray
-    lowest: float
+    lowest: FloatArray  # (cells,) least det F
     tangent: FloatArray | None
     equation: IntArray
 
@@ -40,6 +41,7 @@ class Assembler:
     def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:
         self.model = model
         self._cells = model.unknowns_of_cells()
+        self._nodes = model.space.cells.copy()  # writable, as what is picked from it: kernels are compiled once
         free = np.ones(model.unknowns, dtype=bool)
         free[fixed] = False
         self._own = np.where(free, np.cumsum(free) - 1, -1)  # -1 where fixed
@@ -49,25 +51,34 @@ class Assembler:
         self._row_of = np.repeat(np.arange(self.size), np.diff(self.indptr))
         above = self.indices != self._row_of
         self._columns = [np.flatnonzero((self.indices == self.own_equations + n) & above) for n in range(len(shared))]
-        may_share = np.concatenate([np.empty(0, dtype=np.int64), *shared.values()])
-        self._touched = np.flatnonzero(np.isin(self._cells, may_share).any(axis=1))
-        pairs = self._cells.shape[1] * (self._cells.shape[1] + 1) // 2
-        self._places = np.empty((len(self._cells), pairs), dtype=np.int32)
         self.equation = self._own
-        self._last = _Evaluated(np.empty(0), np.empty(0), np.inf, None, self.equation)
-        self._locate(np.arange(len(self._cells)))
+        self._places = self._located(np.arange(len(self._cells)), self.equation)
+        self.forget()
 
     def share(self, followers: Mapping[int, IntArray]) -> None:
         """Let unknowns follow shared equations, numbered as at the start; all others keep their own."""
         equation = self._own.copy()
         for number, unknowns in followers.items():
             equation[unknowns] = self.own_equations + number
-        if not np.array_equal(equation, self.equation):
+        if (changed := equation != self.equation).any():
             self.equation = equation
-            self._locate(self._touched)
+            cells = self._around(changed)
+            self._places[cells] = self._located(cells, equation)
 
-    def _locate(self, which: IntArray) -> None:
-        in_parts(_locate, len(which), self._cells, self.equation, self.indptr, self.indices, which, self._places)
+    def forget(self) -> None:
+        """Evaluate the next state as a whole, so that no digit of it depends on those before."""
+        self._last = _Evaluated(np.empty(0), np.empty(0), np.empty(0), None, self.equation)
+
+    def _around(self, unknowns: BoolArray) -> IntArray:
+        """Cells that have one of these unknowns."""
+        return np.flatnonzero(unknowns[self._cells].any(axis=1))
+
+    def _located(self, cells: IntArray, equation: IntArray) -> IntArray:
+        """Places (cells, pairs) in the upper triangle where cells add their tangents, see `_locate`."""
+        width = self._cells.shape[1]
+        places = np.empty((len(cells), width * (width + 1) // 2), dtype=np.int32)
+        in_parts(_locate, len(cells), self._cells[cells], equation, self.indptr, self.indices, places)
+        return places
 
     @property
     def force_equations(self) -> BoolArray:
@@ -90,21 +101,17 @@ class Assembler:
         ``ahead`` forms the tangent in the same sweep, which is quicker where it is asked for next.
         """
         if not np.array_equal(state, self._last.state):
-            forces = np.zeros(self.model.unknowns)
-            tangent = np.zeros(len(self.indices)) if ahead else None
-            lowest = self._run(state, forces, tangent)
-            self._last = _Evaluated(state.copy(), forces, lowest, tangent, self.equation)
+            self._last = (self._corrected(state) if ahead else None) or self._evaluated(state, ahead=ahead)
         by_unknown = self._last.forces.copy()
-        return by_unknown, self.by_equation(by_unknown), self._last.lowest
+        return by_unknown, self.by_equation(by_unknown), float(self._last.lowest.min())
 
     def tangent(self, state: FloatArray) -> FloatArray:
         """Values of the upper triangle of the tangent, in the order of `indices`."""
         last = self._last
-        if last.tangent is not None and last.equation is self.equation and np.array_equal(state, last.state):
-            data = last.tangent.copy()
-        else:
-            data = np.zeros(len(self.indices))
-            self._run(state, np.zeros(self.model.unknowns), data)
+        if last.tangent is None or last.equation is not self.equation or not np.array_equal(state, last.state):
+            last = self._evaluated(state, ahead=True)
+        assert last.tangent is not None
+        data = last.tangent.copy()
         data[self.indptr[self.idle]] = 1.0  # the diagonal stands first in its row
         return data
 
@@ -138,14 +145,40 @@ class Assembler:
             _add_products(self._cells[part], local, directions, product)
         return product
 
-    def _run(self, state: FloatArray, forces: FloatArray, data: FloatArray | None) -> float:
-        lowest = np.inf
-        for part, local_forces, local, volumes in self._in_chunks(state, None, with_tangent=data is not None):
-            lowest = min(lowest, float(volumes.min()))
-            _add_forces(self._cells[part], local_forces, forces)
-            if data is not None:
-                _add_tangents(self._places[part], local, data)
-        return lowest
+    def _evaluated(self, state: FloatArray, *, ahead: bool) -> _Evaluated:
+        """Forces of all cells at a state and, ``ahead``, the tangent."""
+        tangent = np.zeros(len(self.indices)) if ahead else None
+        found = _Evaluated(
+            state.copy(), np.zeros(self.model.unknowns), np.empty(len(self._cells)), tangent, self.equation
+        )
+        self._add(found, state, None, self._places)
+        return found
+
+    def _corrected(self, state: FloatArray) -> _Evaluated | None:
+        """The last evaluation, with the cells around a few unknowns that moved, or follow others now, anew; or None."""
+        last = self._last
+        if last.tangent is None or not last.lowest.min() > 0.0:
+            return None
+        other = (state != last.state) | (self.equation != last.equation)
+        if np.count_nonzero(other) > _FEW * len(other):
+            return None
+        found = _Evaluated(state.copy(), last.forces, last.lowest, last.tangent, self.equation)
+        cells = self._around(other)
+        self._add(found, last.state, cells, self._located(cells, last.equation), sign=-1.0)
+        self._add(found, state, cells, self._places[cells])
+        return found
+
+    def _add(
+        self, found: _Evaluated, state: FloatArray, cells: IntArray | None, places: IntArray, *, sign: float = 1.0
+    ) -> None:  # fmt: skip
+        """Add what cells, all by default, contribute at a state; ``places`` are theirs, in their order."""
+        done = 0
+        for part, forces, tangents, lowest in self._in_chunks(state, cells, with_tangent=found.tangent is not None):
+            _add_forces(self._cells[part], sign, forces, found.forces)
+            found.lowest[part] = lowest
+            if found.tangent is not None:
+                _add_tangents(places[done : done + len(lowest)], sign, tangents, found.tangent)
+            done += len(lowest)
 
     def _in_chunks(
         self, state: FloatArray, cells: IntArray | None, *, with_tangent: bool
@@ -156,14 +189,15 @@ class Assembler:
         u = np.ascontiguousarray(state[:count].reshape(-1, 3))
         p = np.ascontiguousarray(state[count:])
         forces = np.empty((_CHUNK, self._cells.shape[1]))
-        tangents = np.empty((_CHUNK if with_tangent else 1, self._places.shape[1]))
+        width = self._cells.shape[1]
+        tangents = np.empty((_CHUNK if with_tangent else 1, width * (width + 1) // 2))
         volumes = np.empty(_CHUNK)
         total = len(self._cells) if cells is None else len(cells)
         for start in range(0, total, _CHUNK):
             stop = min(start + _CHUNK, total)
             part = slice(start, stop) if cells is None else cells[start:stop]
             in_parts(
-                _elements, stop - start, space.cells[part], space.pressure_cells[part], m.volumes_mm3[part],
+                _elements, stop - start, self._nodes[part], space.pressure_cells[part], m.volumes_mm3[part],
                 m.inverse[part], m.law[part], m.vectors, m.shear_mpa, m.bulk_mpa, m.own_bulk_mpa, element.weights,
                 element.gradients, element.pressure, element.stabilisation, u, p, with_tangent, forces, tangents,
                 volumes,
@@ -187,13 +221,12 @@ class Assembler:
 
 @njit(nogil=True, cache=True)
 def _locate(
-    start: int, stop: int, cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, which: IntArray,
-    places: IntArray,
+    start: int, stop: int, cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, places: IntArray
 ) -> None:  # fmt: skip
     """Place in the upper triangle of each pair of a cell's unknowns; -1: one is fixed; -2 - place: it counts twice."""
     width = cells.shape[1]
-    for n in range(start, stop):
-        cell, pair = which[n], 0
+    for cell in range(start, stop):
+        pair = 0
         for i in range(width):
             for j in range(i, width):
                 row, column = equation[cells[cell, i]], equation[cells[cell, j]]
@@ -215,21 +248,21 @@ def _locate(
 
 
 @njit(cache=True)
-def _add_forces(cells: IntArray, local: FloatArray, forces: FloatArray) -> None:
+def _add_forces(cells: IntArray, sign: float, local: FloatArray, forces: FloatArray) -> None:
     for n in range(len(cells)):
         for i in range(cells.shape[1]):
-            forces[cells[n, i]] += local[n, i]
+            forces[cells[n, i]] += sign * local[n, i]
 
 
 @njit(cache=True)
-def _add_tangents(places: IntArray, local: FloatArray, data: FloatArray) -> None:
+def _add_tangents(places: IntArray, sign: float, local: FloatArray, data: FloatArray) -> None:
     for n in range(len(places)):
         for pair in range(places.shape[1]):
             place = places[n, pair]
             if place >= 0:
-                data[place] += local[n, pair]
+                data[place] += sign * local[n, pair]
             elif place < -1:
-                data[-2 - place] += 2.0 * local[n, pair]
+                data[-2 - place] += 2.0 * sign * local[n, pair]
 
 
 @njit(cache=True)

@@ -7,11 +7,13 @@ as long as that is quicker: either way as the preconditioner of an iterative sol
 
 import platform
 from contextlib import suppress
+from ctypes import POINTER, byref, c_int32, c_int64, c_void_p
 from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse import linalg
 
@@ -21,8 +23,9 @@ from dvc.errors import MrstrainError
 _MOST_STEPS = 10  # of the iterative method: as long as a factorisation, on the meshes that are common here
 _FINE = 1e-8  # residual of a solution by the matrix's own factors
 # PARDISO's own choices for this kind of matrix, which have to be named where one of them is changed (counted from 1):
-# METIS, least pivots of 1e-8, neither scaling nor matching, Bunch-Kaufman pivots; and (28) single precision.
-_IN_SINGLE = {1: 1, 2: 2, 8: 0, 10: 8, 11: 0, 13: 0, 21: 1, 28: 1}
+# METIS, least pivots of 1e-8, neither scaling nor matching. Changed: (21) pivots are taken on the diagonal as they
+# come, and not in pairs (Bunch and Kaufman), and (28) single precision.
+_IN_SINGLE = {1: 1, 2: 2, 8: 0, 10: 8, 11: 0, 13: 0, 21: 0, 28: 1}
 
 
 class SingularError(MrstrainError, RuntimeError):
@@ -33,9 +36,10 @@ class _Pardiso:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
         from pypardiso import PyPardisoSolver
 
-        self.rough = rough
+        self.rough, self.size = rough, len(indptr) - 1
         self._kind = np.float32 if rough else np.float64
-        self._matrix = sparse.csr_matrix((np.ones(len(indices), self._kind), indices, indptr))
+        self._pattern = [np.asarray(of + 1, dtype=np.int32) for of in (indptr, indices)]  # counted from 1
+        self._values = np.empty(0, dtype=self._kind)
         self._solver = PyPardisoSolver(mtype=-2)  # real, symmetric, indefinite
         for number, value in _IN_SINGLE.items() if rough else ():
             self._solver.set_iparm(number, value)
@@ -43,23 +47,32 @@ class _Pardiso:
         self._analysed = False
 
     def factorise(self, data: FloatArray) -> None:
-        from pypardiso.pardiso_wrapper import PyPardisoError
-
-        self._matrix.data = np.ascontiguousarray(data, dtype=self._kind)
-        empty = np.zeros(self._matrix.shape[0], dtype=self._kind)
-        try:
-            for phase in (22,) if self._analysed else (11, 22):
-                self._solver.set_phase(phase)
-                self._solver._call_pardiso(self._matrix, empty)
-        except PyPardisoError as failure:
-            raise SingularError(f"The system cannot be factorised (PARDISO, error {failure.value}).") from failure
+        self._values = np.ascontiguousarray(data, dtype=self._kind)
+        empty = np.zeros(self.size, dtype=self._kind)
+        for phase in (22,) if self._analysed else (11, 22):
+            self._call(phase, empty)
         self._analysed = True
 
     def solve(self, right: FloatArray) -> FloatArray:
-        self._solver.set_phase(33)
         size = float(np.abs(right).max()) or 1.0  # no force is too small for single precision
-        solution = self._solver._call_pardiso(self._matrix, np.ascontiguousarray(right / size, dtype=self._kind))
+        solution = self._call(33, np.asarray(right / size, dtype=self._kind))
         return size * np.asarray(solution, dtype=np.float64)
+
+    def _call(self, phase: int, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """What `PyPardisoSolver` does, without a copy of the pattern at every call."""
+        solution, error, one = np.zeros_like(right), c_int32(0), byref(c_int32(1))
+        kind, which, size = (byref(c_int32(number)) for number in (self._solver.mtype, phase, self.size))
+        ia, ja, perm, iparm = (
+            of.ctypes.data_as(POINTER(c_int32)) for of in (*self._pattern, self._solver.perm, self._solver.iparm)
+        )
+        a, b, x = (of.ctypes.data_as(c_void_p) for of in (self._values, right, solution))
+        self._solver._mkl_pardiso(
+            self._solver.pt.ctypes.data_as(POINTER(c_int64)), one, one, kind, which, size, a, ia, ja, perm, one, iparm,
+            byref(c_int32(0)), b, x, byref(error),
+        )  # fmt: skip
+        if error.value:
+            raise SingularError(f"The system cannot be factorised (PARDISO, error {error.value}).")
+        return solution
 
     def close(self) -> None:
         self._solver.free_memory(everything=True)

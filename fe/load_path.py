@@ -288,6 +288,7 @@ class Loading:
         self._began, self._counted = time.monotonic() - (earlier.seconds if earlier else 0.0), path.iterations
         self._stages, self._complete = 0, False
         path.solver.forget()  # so that a load depends on where it begins, and not on what was solved before
+        path.assembler.forget()
         path.curve = path.curve[-1:]
         if earlier is not None:
             path.curve = list(earlier.curve)

@@ -27,7 +27,8 @@ from validate.location import Overlap
 from validate.mapping import ALL
 from validate.misfit import check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
-from validate.report import area_rows, closing_sections, draw, load_sections, overview, shown
+from validate.report import Drawn, area_rows, closing_sections, draw, load_sections, overview, pictures_of_all, shown
+from validate.strain_by_load import Strip
 from validate.tables import Curve
 
 _COVERED = 0.9  # fraction of the mesh; a model that covers less is noted
@@ -166,10 +167,14 @@ class Comparison:
         about = dict(record) if record is not None else {"parameters": {"strains": list(self.strains)}}
         colours = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
         notes = [note for note in self.notes if note not in _doubts(self.verdict)]
-        sections = [overview(self.loads, self.ranking, self.warnings, notes)]
-        write_one = partial(_write_load, folder=target, colours=colours, about=about, on_image=on_image)
-        for of_load in each(write_one, self.loads):
-            sections += of_load
+        drawn = partial(draw, colours=colours, image=self.loads[0].case.image)
+        write_one = partial(_write_load, folder=target, drawn=drawn, about=about, on_image=on_image)
+        parts, strips = zip(*each(write_one, self.loads), strict=True)
+        of_all = pictures_of_all(strips, self.curves, self.strains, self.ranking)
+        for stem, picture in of_all.items():
+            (target / f"{stem}.png").write_bytes(picture.png)
+        first = overview(self.loads, self.ranking, self.warnings, notes, [*of_all.values()])
+        sections = [first, *(section for part in parts for section in part)]
         known = {load: of for load, of in self.verdicts.items() if of is not None}
         levels = {load: of.level for load, of in known.items()}
         levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
@@ -214,10 +219,10 @@ class Comparison:
 
 
 def _write_load(
-    one: LoadComparison, folder: Path, colours: Sequence[str], about: Mapping[str, object], on_image: bool
-) -> list[Section]:
-    """Write the folder of one load; return its sections of the report."""
-    pictures, viewer = draw(one, colours)
+    one: LoadComparison, folder: Path, drawn: Callable[..., Drawn], about: Mapping[str, object], on_image: bool
+) -> tuple[list[Section], Strip]:
+    """Write the folder of one load; return its sections of the report, and its part of the first picture."""
+    pictures, viewer, strip = drawn(one)
     with whole_folder(folder / one.load) as part:
         tables.write_fields(part / "fields.vtu", one)
         for stem, picture in pictures.items():
@@ -225,7 +230,7 @@ def _write_load(
         if on_image:
             tables.write_on_image(part, one)
         write_json(part / "provenance.json", {**about, "verdict": _plain(one.case.verdict)})
-    return load_sections(one, pictures, viewer)
+    return load_sections(one, pictures, viewer), strip
 
 
 @checked

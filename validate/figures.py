@@ -64,6 +64,14 @@ def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Fig
     return _curves(curves, "load", strains, models)
 
 
+def all_loads(curves: Sequence[Curve], strains: tuple[float, float]) -> bytes:
+    """Volume of tissue above each maximum shear strain, a panel for each load: measured (black) and simulated.
+
+    The grey band contains the true curve in 95 % of cases; areas are taken between the dotted lines.
+    """
+    return png_bytes(curves_by_load(curves, strains))
+
+
 def areas_by_load(areas: Sequence[Area]) -> Figure:
     """Area between curves by load and model: the estimate with its 95 % interval, or as measured if that is unknown."""
     models, loads = (list(dict.fromkeys(getattr(a, of) for a in areas)) for of in ("model", "load"))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple
+from pathlib import Path
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
 from validate.ranking import ALL_LOADS, Ranking, no_nearer
+from validate.strain_by_load import MEASURED, Strip, strain_by_load
+from validate.tables import Curve
 
 _AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
 _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
@@ -44,8 +47,12 @@ _CLOSING = Section(
 )  # fmt: skip
 
 
-def draw(one: LoadComparison, colours: Sequence[str]) -> tuple[dict[str, Picture], Viewer]:
-    """A load's pictures, by the stem of their files, and its viewer; ``colours`` lists all models in colour order."""
+Drawn = tuple[dict[str, Picture], Viewer, Strip]
+"""A load's pictures, by the stem of their files, its viewer, and its part of the first picture of the report."""
+
+
+def draw(one: LoadComparison, colours: Sequence[str], image: Path | None) -> Drawn:
+    """Draw a load; ``colours`` lists all models in colour order, ``image`` shows the anatomy in all viewers."""
     measured, results = one.case.read()
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
@@ -65,7 +72,8 @@ def draw(one: LoadComparison, colours: Sequence[str]) -> tuple[dict[str, Picture
         "differences_shear": Picture.drawn("Differences of maximum shear strain", *shear),
         "differences_u": Picture.drawn("Differences of the displacement's magnitude", *u),
     }
-    return pictures, _viewer(one, measured, results)
+    lowest = lowest_bone_point(one.labels, bone, axes)
+    return pictures, _viewer(one, measured, results, image), Strip.of(one, measured, results, lowest)
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
@@ -82,12 +90,11 @@ def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
     return filled_from_nearest(result.deformation.displacement(points_mm), points_mm)
 
 
-def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResult]) -> Viewer:
-    """Measured strain and that of the best model over the image, on the label map's voxels.
-
-    The image is the loaded one as registered, on the unloaded anatomy, if the case has one; else the label map.
-    """
-    labels, scanned = one.labels, one.case.image
+def _viewer(
+    one: LoadComparison, measured: Deformation, results: Sequence[FeResult], scanned: Path | None
+) -> Viewer:  # fmt: skip
+    """Measured strain and that of the best model over an image, or over the label map, on its voxels."""
+    labels = one.labels
     box = Mask(labels.grid, labels.labels > 0).box(_AROUND)
     soft = [number for number, name in labels.names.items() if name not in one.bones]
     grid, inside = labels.grid.part(box), np.isin(labels.labels[box], soft)
@@ -128,12 +135,33 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     ]
 
 
+def pictures_of_all(
+    strips: Sequence[Strip], curves: Sequence[Curve], strains: tuple[float, float], ranking: Ranking
+) -> dict[str, Picture]:
+    """The first pictures of a report, by the stem of their files: slices and curves under all loads."""
+    model = ranking.areas[0].model if ranking.areas else next(n for n in strips[0].max_shear if n != MEASURED)
+    pages = [strip.max_shear[name] for strip in strips for name in (MEASURED, model) if name in strip.max_shear]
+    known = np.concatenate([page[np.isfinite(page)] for page in pages])
+    highest = max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
+    best = "the best match over all loads" if ranking.areas else "a model"
+    note = f"Below: {model}, {best}. {strips[0].title}, through the lowest point of the bone."
+    slices, of_all = (strips, model, highest), [curve for curve in curves if curve.tissue == ALL]
+    return {
+        "slices_by_load": Picture.drawn("Measured and simulated strain", strain_by_load, *slices, note=note),
+        "curves_by_load": Picture.drawn("Volume above a strain, all soft tissue", figures.all_loads, of_all, strains),
+    }
+
+
 def overview(
-    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[str], notes: Sequence[str]
-) -> Section:
-    """The first part of the report: areas of all models under all loads, with ``warnings`` about models."""
+    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[str], notes: Sequence[str],
+    pictures: Sequence[Picture],
+) -> Section:  # fmt: skip
+    """The first part of the report: which model fits best, pictures, areas, and ``warnings`` about models."""
     slips = Verdict("caution", tuple(warnings)) if warnings else None
-    return Section("Models and loads", slips, (_areas(loads, ranking),), (), (*ranking.statements, *notes))
+    areas = (_areas(loads, ranking),)
+    return Section(
+        "Models and loads", slips, areas, tuple(pictures), (*ranking.statements, *notes), pictures_first=True
+    )
 
 
 def _head(one: LoadComparison) -> str:

@@ -112,7 +112,7 @@ def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
         earlier = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["coverage_ml"])
     except (OSError, ValueError, KeyError, TypeError):
         return
-    for name in (*TABLES, CURVES, RECORD, "report.html"):
+    for name in (*TABLES, CURVES, RECORD, "report.html", "slices_by_load.png", "curves_by_load.png"):
         (folder / name).unlink(missing_ok=True)
     for load in earlier:
         if load not in loads and (folder / load / "fields.vtu").is_file():

@@ -293,7 +293,9 @@ class Measurement:
         tables += [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
         tables += page.error_tables(bars)
         notes = ["" if found is None else found.settings.engine.note, *bars.summary]
-        return Section(self.name, self.verdict, tuple(tables), tuple(pictures.values()), tuple(filter(None, notes)))
+        short = page.summary_table(self.regions, self.intervals)
+        texts, drawn = tuple(filter(None, notes)), tuple(pictures.values())
+        return Section(self.name, self.verdict, tuple(tables), drawn, texts, summary=short)
 
     def pictures(self) -> dict[str, Picture]:
         """The figures of a report, by the name of their file; InputError for one that was read from a folder."""

@@ -138,6 +138,17 @@ def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> 
     return Table("Maximum shear strain", columns, rows)
 
 
+def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
+    """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known."""
+    known = {(i.region, i.figure): f" ({shown(i.low)} to {shown(i.high)})" for i in intervals}
+    rows = tuple(
+        (r.region, *(shown(getattr(r, figure)) + known.get((r.region, figure), "") for figure in ("median", "p95")))
+        for r in regions
+        if r.quantity == "max_shear"
+    )
+    return Table("Maximum shear strain", ("tissue", "median", "95th percentile"), rows)
+
+
 def error_tables(bars: ErrorBars) -> list[Table]:
     """The intervals, and the errors in the synthetic warp."""
     tables = []

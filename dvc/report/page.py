@@ -31,8 +31,8 @@ _TONES: Mapping[Level | None, tuple[str, str]] = {
     None: ("#0b5cad", "#f0f3f6"),
 }  # fmt: skip
 """Colours of a notebook's headline and its ground, by the level of the verdict in it."""
-_GREYS, _COLOURS = 64, 125  # steps of a volume's values, one byte for each voxel: more are not seen, and take room
-_QUALITY = 82  # of pictures on the page; files of figures lose nothing
+_GREYS, _COLOURS = 32, 125  # steps of a volume's values, one byte for each voxel: more are not seen, and take room
+_QUALITY = 76  # of pictures on the page; files of figures lose nothing
 _SMALL = 100_000  # bytes of a PNG: a chart, which is smaller yet without loss
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"
@@ -147,6 +147,8 @@ class Section:
     paragraphs: tuple[str, ...] = ()
     viewers: tuple[Viewer, ...] = ()
     folded: bool = False
+    pictures_first: bool = False  # before the tables
+    summary: Table | None = None  # for the first part of a report of many sections
 
 
 def shown(value: Cell) -> str:

@@ -268,6 +268,7 @@ class TruthDraws:
                 here = names == name
                 bias[here], sd[here] = table.expected(str(name), shear[here], to_bone_mm[here], run)
             self._expected.append((bias, sd))
+        self._variance = np.mean([sd**2 for _, sd in self._expected], axis=0)
         step = table.correlation_mm / _STEPS
         index = np.rint((points_mm - points_mm.min(axis=0)) / step).astype(np.int64)
         width = np.full(3, 0.5 * table.correlation_mm / step)
@@ -285,12 +286,11 @@ class TruthDraws:
         of the noise's deviation, which is in x once as measured and once as drawn; uniform where noise could have made
         all of the spread.
         """
-        noise = np.mean([sd**2 for _, sd in self._expected], axis=0)
         narrow = np.empty(len(truth))
         for name in np.unique(self._names):
             here = self._names == name
             mean, spread = truth[here].mean(), truth[here].var()
-            kept = max(spread - 2.0 * noise[here].mean(), 0.0) / spread if spread > 0.0 else 0.0
+            kept = max(spread - 2.0 * self._variance[here].mean(), 0.0) / spread if spread > 0.0 else 0.0
             narrow[here] = mean + np.sqrt(kept) * (truth[here] - mean)
         return narrow
 

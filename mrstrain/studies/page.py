@@ -11,9 +11,10 @@ from dvc.report.page import METHODS, Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.records.provenance import provenance, without_folders
+from mrstrain.studies.answer import answer_of
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome, left_out_of
-from mrstrain.studies.plan import REGISTRATION
+from mrstrain.studies.plan import COMPARISON, REGISTRATION
 from mrstrain.studies.true_error import error_against_truth
 
 
@@ -35,8 +36,10 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     stages = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in records.items()}
     write_json(path.with_name(PROVENANCE), record | {"stages": stages})
     against_truth = error_against_truth(study, outcomes)
-    first, *others = [*compared[:1], *against_truth, *compared[1:], *registered, _stages(outcomes)]
-    sections = [first, *(replace(section, folded=True) for section in others)]
+    of_each = [section for of in of_loads.values() for section in of.sections if section.title in study.loads]
+    answer = answer_of(of_each, compared[:1], study.out / COMPARISON)
+    others = [*against_truth, *compared[1:], *registered, _stages(outcomes)]
+    sections = [*answer, *(replace(section, folded=True) for section in others)]
     verdict = _verdict([one for of in of_loads.values() for one in of.verdicts], compared)
     write_report(path, study.study.name, verdict, sections, closing, record_lines(record), notes=_incomplete(outcomes))
 

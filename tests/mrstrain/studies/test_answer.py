@@ -1,0 +1,60 @@
+"""What a study's report says first: measured strain by load and tissue, and the model that is nearest to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dvc.measurement.page import summary_table
+from dvc.report.page import Section, Table
+from dvc.trust.error_model import Interval
+from dvc.trust.regions import RegionRow
+from mrstrain.studies.answer import answer_of
+from tests.validate.test_comparison import case, cube, labels, result, sheared
+from validate import Comparison, Criteria, compare
+
+FAT = RegionRow("fat", "max_shear", 10, 1.0, 10, 0.1, 0.0, 0.131, 0.0, 0.3, 0.425, 0.5, 0.6)
+BONE = replace(FAT, region="bone", median=0.0, p95=0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Models of half and 1.1 times the shear of Load1; under Load2 nothing is nearer than no deformation."""
+    mesh, place = cube(4), tmp_path_factory.mktemp("compared")
+    models = [result(name, mesh, sheared(gamma)) for name, gamma in (("half", 0.2), ("near", 0.44))]
+    cases = [case(load, sheared(gamma), models) for load, gamma in (("Load1", 0.4), ("Load2", 0.01))]
+    compare(cases, labels(), criteria=Criteria((0.05, 0.5))).write(place)
+    assert Comparison.read(place).areas
+    return place
+
+
+def section(load: str) -> Section:
+    intervals = [Interval("fat", "median", 0.131, 0.132, 0.1031, 0.1391), Interval("fat", "p90", 0.3, 0.3, 0.2, 0.4)]
+    return Section(load, summary=summary_table([BONE, FAT, replace(FAT, quantity="jacobian")], intervals))
+
+
+def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path) -> None:
+    overview = Section("Models and loads", tables=(Table("Area", ("model",), (("near",),)),))
+    (first,) = answer_of([section("Load1"), section("Load2"), Section("Load3")], [overview], folder)
+    table, area = first.tables
+    assert (first.title, area.title) == ("Models and loads", "Area")
+    assert table.columns == ("load", "tissue", "median", "95th percentile", "nearest model")
+    assert table.rows == (
+        ("Load1", "bone", "0", "0", "–"),
+        ("Load1", "fat", "0.131 (0.103 to 0.139)", "0.425", "near"),
+        ("Load2", "bone", "0", "0", "–"),
+        ("Load2", "fat", "0.131 (0.103 to 0.139)", "0.425", "–"),
+    )
+
+
+def test_registrations_alone_and_a_comparison_alone_are_shown_too(folder: Path, tmp_path: Path) -> None:
+    (first,) = answer_of([section("Load1")], [], folder)
+    assert first.tables[0].columns == ("load", "tissue", "median", "95th percentile")
+    assert "Nearest model" not in first.tables[0].note
+    overview = Section("Models and loads")
+    assert answer_of([Section("Load1")], [overview], folder) == [overview]
+    assert answer_of([], [], folder) == []
+    (first,) = answer_of([section("Load1")], [overview], tmp_path)  # the comparison's tables are not there
+    assert [row[-1] for row in first.tables[0].rows] == ["–", "–"]

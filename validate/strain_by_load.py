@@ -1,0 +1,152 @@
+"""Measured and simulated strain in one slice of the image under every load: the first picture of a report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from dvc import Deformation, StrainField, evaluate_on_grid
+from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.images.image import reordered_to_lps
+from dvc.io.images.read import read_voxels
+from dvc.report.sheet import (
+    AXES,
+    DPI,
+    FONT,
+    INK,
+    LETTERS,
+    PLANES,
+    SHADOW,
+    WIDTH_IN,
+    Plane,
+    View,
+    levelled,
+    png_bytes,
+    scale_length_mm,
+    window_of,
+)
+from validate.fe_result import FeResult
+from validate.load_comparison import LoadComparison
+
+MEASURED = "measured"
+_GAP_IN, _HEAD_IN, _SIDE_IN, _FOOT_IN, _TALLEST_IN = 0.06, 0.3, 0.3, 0.62, 3.2
+_COLOURS = colormaps["viridis"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Strip:
+    """A slice of one load: the image, outlines, and the max. shear as measured and by each model, on its voxels."""
+
+    load: str
+    plane: Plane
+    extent_mm: tuple[float, float, float, float]
+    title: str
+    image: FloatArray  # rows downward, columns to the right; 0 to 1
+    outlines: tuple[BoolArray, ...]
+    max_shear: Mapping[str, Float32Array]  # by model, and as `MEASURED`; NaN where it is not defined
+
+    @classmethod
+    def of(
+        cls, one: LoadComparison, measured: Deformation, results: Sequence[FeResult], point_mm: FloatArray
+    ) -> "Strip":
+        """The slice of the label map's voxels through a point, LPS mm, nearest to the plate's normal and shear."""
+        labels, scanned = one.labels, one.case.image
+        across = np.abs(np.cross(one.case.axes[:, 0], one.case.axes[:, 1]))
+        plane = PLANES[int(np.argmax(across))]
+        view = View.through(labels.grid, point_mm, labels.labels > 0)
+        shown = np.zeros(labels.grid.shape)
+        if scanned is not None:
+            seen, voxels = read_voxels(scanned)
+            shown = np.nan_to_num(voxels) if seen.same_as(labels.grid) else shown
+        bones = [number for number, name in labels.names.items() if name in one.bones]
+        soft = (labels.labels > 0) & ~np.isin(labels.labels, bones) & _in_slice(view, plane)
+        fields: dict[str, Deformation] = {MEASURED: measured} | {r.name: r.deformation for r in results}
+        pages: dict[str, Float32Array] = {}
+        for name, field in fields.items():
+            values = np.full(labels.grid.shape, np.nan, dtype=np.float32)
+            values[soft] = StrainField.from_gradient(evaluate_on_grid(field, labels.grid, soft)[1]).max_shear
+            pages[name] = view.cut(values, plane)
+        masks = labels.labels > 0, np.isin(labels.labels, bones)
+        return cls(
+            one.load, plane, view.extent_mm(plane), view.title(plane),
+            levelled(view.cut(shown, plane), window_of(view, shown)),
+            tuple(view.cut(mask, plane) for mask in masks), pages,
+        )  # fmt: skip
+
+
+def _in_slice(view: View, plane: Plane) -> BoolArray:
+    """The voxels (ni, nj, nk) of a grid that the slice of a view shows."""
+    inside, at = np.zeros(view.grid.shape, dtype=bool), AXES[plane][0]
+    everywhere = [slice(None)] * 3
+    everywhere[at] = slice(view.index[at], view.index[at] + 1)
+    reordered_to_lps(view.grid, inside)[tuple(everywhere)] = True
+    return inside
+
+
+def strain_by_load(strips: Sequence[Strip], model: str, highest: float) -> bytes:
+    """Maximum shear strain in one slice of the unloaded anatomy, under each load: measured above, a model below.
+
+    White lines are the surface of the body and of the bones. The image stays grey where strain is not defined.
+    """
+    first = strips[0]
+    left, right, bottom, top = first.extent_mm
+    width_mm, height_mm = right - left, abs(top - bottom)
+    inches = min((WIDTH_IN - _SIDE_IN) / len(strips) / width_mm - _GAP_IN / width_mm, _TALLEST_IN / height_mm)
+    w, h = inches * width_mm, inches * height_mm
+    size = _SIDE_IN + len(strips) * (w + _GAP_IN), _HEAD_IN + 2 * (h + _GAP_IN) + _FOOT_IN
+    figure, norm = Figure(figsize=size, dpi=DPI, facecolor="white"), Normalize(0.0, highest)
+    FigureCanvasAgg(figure)
+    for row, name in enumerate((MEASURED, model)):
+        low = _FOOT_IN + (1 - row) * (h + _GAP_IN)
+        figure.text(0.12 / size[0], (low + h / 2) / size[1], name, rotation=90, va="center", color=INK, **FONT)
+        for column, strip in enumerate(strips):
+            box = (_SIDE_IN + column * (w + _GAP_IN)) / size[0], low / size[1], w / size[0], h / size[1]
+            axes = figure.add_axes(box, xticks=[], yticks=[], facecolor="black")
+            _paint(axes, strip, name, norm)
+            if row == 0:
+                axes.set_title(strip.load, color=INK, pad=4, **FONT)
+            if row == column == 0:
+                _mark(axes, strip)
+    length = min(4.2, 0.6 * size[0])
+    bar = figure.add_axes(((size[0] - length) / 2 / size[0], 0.42 / size[1], length / size[0], 0.12 / size[1]))
+    figure.colorbar(ScalarMappable(norm, _COLOURS), cax=bar, orientation="horizontal", extend="max")
+    bar.set_xlabel("maximum shear strain (E₁ − E₃)/2", color=INK, labelpad=2, **FONT)
+    bar.tick_params(labelsize=9, length=3, pad=2)
+    return png_bytes(figure)
+
+
+def _paint(axes: Axes, strip: Strip, name: str, norm: Normalize) -> None:
+    left, right, bottom, top = strip.extent_mm
+    how: dict[str, Any] = {"extent": strip.extent_mm, "origin": "upper", "aspect": "auto"}
+    axes.imshow(strip.image, cmap="gray", vmin=0.0, vmax=1.0, **how)
+    values: npt.NDArray[Any] | None = strip.max_shear.get(name)
+    if values is None:
+        axes.text(0.5, 0.5, "no result", transform=axes.transAxes, ha="center", color="white", path_effects=SHADOW)
+    else:
+        axes.imshow(np.ma.masked_invalid(values), cmap=_COLOURS, norm=norm, interpolation="nearest", **how)
+    for mask in strip.outlines:
+        if mask.any() and not mask.all() and min(mask.shape) > 1:
+            rows, columns = mask.shape
+            x = left + (np.arange(columns) + 0.5) * (right - left) / columns
+            y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
+            axes.contour(x, y, mask.astype(float), levels=[0.5], colors=["white"], linewidths=0.8)
+
+
+def _mark(axes: Axes, strip: Strip) -> None:
+    """Letters of the sides of the body, and a scale bar."""
+    white: dict[str, Any] = {"color": "white", "path_effects": SHADOW, "transform": axes.transAxes}
+    spots = (0.015, 0.5, "left", "center"), (0.985, 0.5, "right", "center"), (0.5, 0.985, "center", "top")
+    for letter, (x, y, ha, va) in zip(LETTERS[strip.plane], (*spots, (0.5, 0.015, "center", "bottom")), strict=True):
+        axes.text(x, y, letter, ha=ha, va=va, weight="bold", **white, **FONT)
+    width = strip.extent_mm[1] - strip.extent_mm[0]
+    length = scale_length_mm(width)
+    axes.plot([0.04, 0.04 + length / width], [0.04, 0.04], linewidth=2.5, solid_capstyle="butt", **white)
+    axes.text(0.04, 0.055, f"{length:g} mm", va="bottom", fontsize=9, **white)
