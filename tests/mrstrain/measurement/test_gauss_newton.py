@@ -96,7 +96,7 @@ def test_a_change_of_volume_that_was_allowed_is_told_and_costs_trust(tiny_pair, 
     )  # fmt: skip
     told = json.loads((tmp_path / "out" / "loaded" / "quality.json").read_text())
     assert told["verdict"]["level"] != "trust"
-    assert any("ask for a change of volume" in reason for reason in told["verdict"]["reasons"])
+    assert any("images indicate volume changes" in reason for reason in told["verdict"]["reasons"])
     report = (tmp_path / "out" / "report.html").read_text()
     assert "gradient of the volume change" in report
     assert "Only the gradient of the volume change was penalised" in report
