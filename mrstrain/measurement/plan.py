@@ -81,15 +81,15 @@ def _twin_check(
     The measured strain is the true one of this twin, which lies on the loaded image's grid and is as noisy as the
     noisier of the two images.
     """
-    tell("making the twin", 0.0)
+    tell("making the synthetic warp", 0.0)
     near, tissue = found.alignment.motion, found.tissue
     try:
         acquisition = Acquisition(found.settings.seed, found.loaded.grid, noise_factor=_noisier(found))
         twin = synthetic_warp(found.reference, tissue, found.total, acquisition, near=near, beyond_missing=True).image
-        tell("making the twin", 1.0)
+        tell("making the synthetic warp", 1.0)
         again = dvc.register(
             found.reference, twin, bone=subject.bone, tissue=tissue, labels=subject.labels, settings=found.settings,
-            start=start, worker=worker, progress=lambda stage, fraction: tell(f"twin: {stage}", fraction),
+            start=start, worker=worker, progress=lambda stage, fraction: tell(f"synthetic warp: {stage}", fraction),
         )  # fmt: skip
     except MrstrainError as reason:
         return TwinCheck(None, str(reason))

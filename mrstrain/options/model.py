@@ -110,7 +110,7 @@ class Options(BaseModel):
 def reason(error: Mapping[str, Any]) -> str:
     """Why pydantic refuses a value, and the value."""
     if error["type"] == "missing":
-        return "is required"
+        return "a value is required"
     why = error["msg"].removeprefix("Value error, ")
     if error["type"] == "literal_error":
         why = f"must be {error['ctx']['expected'].replace(chr(39), '')}"

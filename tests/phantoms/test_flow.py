@@ -181,7 +181,7 @@ def test_refuses_bad_shapes() -> None:
     rest = Border(body, 1.0)
     with pytest.raises(InputError, match="width_mm of a flow must be positive"):
         Flow(np.zeros(3), np.zeros(3), rest, np.zeros(3), np.array([1.0, 0.0, 1.0]))
-    with pytest.raises(InputError, match="pivot_mm needs three"):
+    with pytest.raises(InputError, match="pivot_mm of a flow needs three"):
         Flow(np.zeros(3), np.zeros(2), rest, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="one step"):
         Flow(np.zeros(3), np.zeros(3), rest, np.zeros(3), np.ones(3), steps=0)

@@ -93,7 +93,7 @@ def test_refuses_what_is_no_motion() -> None:
     with pytest.raises(InputError, match="radius"):
         Bending(CENTRE, X, Z, -3.0)
     without = Composed([stretched(np.ones(3), CENTRE), _NoInverse()])
-    with pytest.raises(InputError, match="_NoInverse has none"):
+    with pytest.raises(InputError, match="its _NoInverse has no inverse"):
         without.inverse()
 
 

@@ -146,7 +146,7 @@ def test_what_no_image_can_show_is_refused(unloaded: tuple[Image, Mask]) -> None
     with pytest.raises(InputError, match="field of view"):
         synthetic_warp(image, body, RigidMotion(np.eye(3), np.array([90.0, 0.0, 0.0])), Acquisition(seed=1))
     other = Mask(Grid(body.grid.shape, body.grid.spacing_mm, body.grid.origin_mm + 1.0), body.inside)
-    with pytest.raises(InputError, match="not on the unloaded image"):
+    with pytest.raises(InputError, match="on another grid than the unloaded image"):
         synthetic_warp(image, other, RigidMotion.identity(), Acquisition(seed=1))
     part = np.zeros(body.grid.shape, dtype=bool)
     part[:20] = True

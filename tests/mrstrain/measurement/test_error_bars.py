@@ -287,7 +287,7 @@ def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
     allowed, kept = (Choice(GaussNewton().weights, "", asked=asked) for asked in (0.05, 0.01))
     doubted = with_caution(Verdict("trust"), allowed)
     assert doubted.level == "caution"
-    assert "ask for a change of volume, of 5.0 % or more" in doubted.reasons[0]
+    assert "volume changes of at least 5.0 %" in doubted.reasons[0]
     assert with_caution(Verdict("trust"), kept).level == "trust"
     assert with_caution(Verdict("caution", ("Less alike.",)), allowed).level == "distrust"
     folded = with_caution(Verdict("distrust", ("It folds.",)), allowed)

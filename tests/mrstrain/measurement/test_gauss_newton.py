@@ -96,7 +96,7 @@ def test_a_change_of_volume_that_was_allowed_is_told_and_costs_trust(tiny_pair, 
     )  # fmt: skip
     told = json.loads((tmp_path / "out" / "loaded" / "quality.json").read_text())
     assert told["verdict"]["level"] != "trust"
-    assert any("ask for a change of volume" in reason for reason in told["verdict"]["reasons"])
+    assert any("images indicate volume changes" in reason for reason in told["verdict"]["reasons"])
     report = (tmp_path / "out" / "report.html").read_text()
     assert "gradient of the volume change" in report
     assert "Only the gradient of the volume change was penalised" in report
@@ -226,7 +226,7 @@ def test_the_twin_of_a_pair_is_measured_again_and_told(tiny_pair, tmp_path):
         progress=lambda case, stage, _: stages.append((case, stage)),
     )  # fmt: skip
     assert not results.failures
-    assert ("Load1", "making the twin") in stages
+    assert ("Load1", "making the synthetic warp") in stages
     quality = json.loads((tmp_path / "out" / "Load1" / "quality.json").read_text())
     (row,) = quality["error_of_max_shear"]["twin"]
     shear = read_image(tmp_path / "out" / "Load1" / "max_shear.nii.gz", allow_missing=True).values

@@ -317,7 +317,7 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         register(**missing)
     labels = layers["labels"]
     aside = labels.grid.moved_by(np.eye(3), np.array([50.0, 0.0, 0.0]))
-    with pytest.raises(InputError, match="not on the unloaded image's grid"):
+    with pytest.raises(InputError, match="not on the grid of the unloaded image"):
         register(**{**layers, "labels": replace(labels, grid=aside)})
     with pytest.raises(InputError, match="label map is empty"):
         register(**{**layers, "labels": replace(labels, labels=np.zeros_like(labels.labels))})

@@ -127,7 +127,7 @@ def test_row_8_one_image_given_twice_is_refused_before_anything_is_made(spy, sca
     shutil.copy(scans / f"{'Load0' if load0 == 'Load0' else 'Load1'}.nii.gz", tmp_path / "copy.nii.gz")
     second = tmp_path / "copy.nii.gz" if load == "copy" else scans / f"{load}.nii.gz"
     loads = [scans / "Load1.nii.gz", scans / "Load2.nii.gz", second]
-    with pytest.raises(InputError, match=rf"{load}\.nii\.gz are the same image: every voxel is equal"):
+    with pytest.raises(InputError, match=rf"{load}\.nii\.gz are the same image: all voxels are equal"):
         register(scans / "Load0.nii.gz", loads, out=tmp_path / "out", bone=scans / "bone.nii.gz")
     assert not (tmp_path / "out").exists()
     assert not spy.asked

@@ -306,7 +306,7 @@ def test_paths_vectors_and_numbers_may_come_as_numpy_and_text() -> None:
     for wrong in (True, "1", float("nan")):
         with pytest.raises(ParameterError, match="bending: "):
             RegistrationOptions.of({"bending": wrong})
-    with pytest.raises(ParameterError, match="labels: it is needed"):
+    with pytest.raises(ParameterError, match="labels: a value is required"):
         mrstrain.compare("a", ["b"], out="c")
     with pytest.raises(TypeError, match="bendin"):
         mrstrain.register("a", ["b"], out="c", bendin=3.0)

@@ -130,7 +130,7 @@ def test_what_cannot_be_studied_is_refused_before_anything_runs(
         (replace(CASE, spacing_mm=(0.1, 0.1, 0.1)), "spacing"),
         (replace(CASE, motion="dance"), "motion"),
         (replace(CASE, preset="heel-xr"), "heel-mr"),
-        (replace(CASE, preset=str(rigid)), "no B-spline"),
+        (replace(CASE, preset=str(rigid)), "not a B-spline"),
         (replace(CASE, motion="wave-3"), "two voxels"),
         (replace(CASE, motion="wave-x"), "wavelength"),
     ):
