@@ -16,8 +16,8 @@ from pathlib import Path
 _OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
 _IMPORTED = re.compile(rf"\n[ \t]*(?:from|import)[ \t]+({'|'.join(_OURS)})\b".encode())
 _DISTRIBUTIONS = (
-    "mrstrain", "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "numba", "nibabel", "pydicom", "meshio",
-    "pytetwild", "vtk", "pypardiso", "mkl", "ngsolve",
+    "mrstrain", "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "numba", "nibabel", "isal", "pydicom",
+    "meshio", "pytetwild", "vtk", "pypardiso", "mkl", "ngsolve",
 )  # fmt: skip
 
 

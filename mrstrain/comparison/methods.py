@@ -120,8 +120,9 @@ def _files(record: Record) -> str:
     formats = sorted({format_of(file["name"]) for role in _IMAGES for file in inputs.get(role, [])})
     images = f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) written,"
     code = f"mrstrain's own code, with nibabel {versions.get('nibabel', '?')} for the headers of NIfTI files"
+    code += f" and isal {versions.get('isal', '?')} for compression"
     if "DICOM" in formats:
-        code += f" and pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} "
+        code += f", pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} "
         code += "where its pixels are compressed in one of the JPEG formats)"
     return f" {images if formats else 'Maps were written'} by {code}."
 

@@ -176,7 +176,7 @@ def test_materials_may_be_given_by_region_or_by_the_name_of_their_set() -> None:
         (0, np.zeros((4, 3)), r"^mesh must be a TetMesh.*; got ndarray of shape \(4, 3\)"),
         (1, "trebi", "No material set 'trebi'; the nearest is 'trebbi'"),
         (1, {"fat": "trebbi"}, r"^materials\['fat'\] must be a material, such as fe\.Ogden.*; got 'trebbi'"),
-        (1, 0.0034, r"^materials must be a set .*fe\.material_set.*; got 0.0034"),
+        (1, 0.0034, r"^materials must be a material set, .*fe\.material_set.*; got 0.0034"),
         (2, (DOWN, ALONG), r"^plate must be a fe\.Plate, .*; got tuple"),
         (2, {"other": fe.Plate(DOWN, ALONG)}, "plate has none for pressed; it has one for other"),
         (3, LOADS[0], r"^loads must be a list, each item a fe\.LoadStep.*; got LoadStep"),

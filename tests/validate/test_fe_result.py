@@ -223,7 +223,7 @@ def test_an_frd_file_with_a_spring_is_read_and_one_that_contradicts_itself_refus
     np.testing.assert_array_equal(u, read_result("heel", path).deformation.evaluate(INSIDE)[0])
     last = text.rindex(f" -1{TAGS[3]:10d}")
     path.write_text(text[:last] + f" -1{7:10d}" + text[last + 13 :])
-    with pytest.raises(ImageFileError, match=r"Load1\.frd: a displacement belongs to node 7, which the file"):
+    with pytest.raises(ImageFileError, match=r"Load1\.frd: a displacement belongs to node 7, which is not defined"):
         read_result("heel", path)
 
 

@@ -192,11 +192,11 @@ def test_files_with_the_same_borders_share_them_and_no_others_do(spline, borders
 
 def test_what_does_not_fit_together_is_refused(spline, borders):
     other = control_grid(GRID, np.full(3, 5.0))
-    with pytest.raises(GeometryError, match="one control grid"):
+    with pytest.raises(GeometryError, match="the same control grid"):
         InterfaceSpline(spline.smooth, BSpline(other, np.zeros((3, *other.shape))), borders)
     labels = layers()
     empty = LabelMap(GRID, np.zeros(GRID.shape, dtype=np.int64), {})
-    with pytest.raises(InputError, match="no tissue"):
+    with pytest.raises(InputError, match="no labelled tissue"):
         Interfaces.of(empty, None, REACH_MM)
     with pytest.raises(InputError, match="above 0"):
         Interfaces.of(labels, None, 0.0)
@@ -311,7 +311,7 @@ def test_the_images_tell_whether_the_skin_resists(along_stiff_skin):
     stiff = along_stiff_skin[1]
     assert stiff.weights.rigidity > 30.0
     assert len(stiff.as_dict()["tried_in_skin"]) >= 3
-    assert stiff.rule.startswith("bending by cross-validation")
+    assert stiff.rule.startswith("bending chosen by cross-validation")
 
 
 def test_without_skin_and_bone_and_with_a_fixed_weight():

@@ -208,8 +208,8 @@ def test_shear_under_a_plate() -> None:
     ("normal", "shear", "message"),
     [
         ([0, 0, 0], [1, 0, 0], "normal must be"),
-        ([0, 0, 1], [0, 0, np.nan], "direction of shear must be"),
-        ([0, 0, 1], [0, 1], "direction of shear must be"),
+        ([0, 0, 1], [0, 0, np.nan], "shear direction must be"),
+        ([0, 0, 1], [0, 1], "shear direction must be"),
         ([0, 0, 1], [0, 0, -3], "parallel"),
         ([1, 2, 3], [1, 2, 3 + 1e-8], "parallel"),
     ],

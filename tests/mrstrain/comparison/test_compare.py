@@ -280,7 +280,7 @@ def test_the_command_takes_one_load_and_one_file(study: Path) -> None:
 def test_what_does_not_fit_is_refused_before_anything_is_written(study: Path) -> None:
     right = study / "right"
     for measured, models, error, message in (
-        (study, [right], InputError, "no results of `register`"),
+        (study, [right], InputError, "no results of `mrstrain register`"),
         (study / "measured", [], InputError, "No model is given"),
         (study / "measured", [study / "nobody"], InputError, "no such model"),
         (study / "measured", [right, right / "Load1.vtu"], InputError, "Two models are called 'right'"),
@@ -292,7 +292,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(study: Path) ->
         ({"bones": ["calcaneus"]}, InputError, "no 'calcaneus'"),
         ({"strains": (0.5, 0.2)}, InputError, "must rise"),
         ({"strains": (20, 50)}, InputError, "no percent"),
-        ({"model_unit": "m"}, (GeometryError, InputError), "no body part is that large"),
+        ({"model_unit": "m"}, (GeometryError, InputError), "too large for a body part"),
         ({"model_frame": "RAS"}, GeometryError, "the other of LPS and RAS"),
     ):
         with pytest.raises(error, match=message):

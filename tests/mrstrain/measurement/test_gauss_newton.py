@@ -45,7 +45,7 @@ def written(made_once, small_pair) -> Path:
 def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(written):
     quality = json.loads((written / "out" / "Load1" / "quality.json").read_text())
     told = quality["regularisation"]
-    assert told["rule"].startswith("bending by cross-validation")
+    assert told["rule"].startswith("bending chosen by cross-validation")
     assert len(told["tried"]) >= 3
     assert min(t["left_out_over_best"] for t in told["tried"]) == 1.0
     assert 0.05 < told["weights"]["bending"] < 1000.0

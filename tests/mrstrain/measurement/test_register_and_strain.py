@@ -209,7 +209,7 @@ def test_the_report_is_one_file_that_fetches_nothing(results, study):
     page = (study / "out" / "report.html").read_text()
     assert "http://" not in page
     assert "https://" not in page
-    assert "<script" not in page
+    assert page.count("<script") == 1  # the page's own
     assert len(page) < 12_000_000
 
 
@@ -327,7 +327,7 @@ def test_row_23_html_in_a_name_is_escaped(study, tiny_pair, tmp_path):
 
     write_report(tmp_path / "r.html", "t", Verdict("trust"), [Section("<script>alert(1)</script>")], [], {"<b>": "<i>"})
     page = (tmp_path / "r.html").read_text()
-    assert "<script>" not in page
+    assert "<script>alert" not in page
     assert "<i>" not in page
 
 

@@ -146,7 +146,7 @@ def test_quality_and_report_tell_the_weights_and_error_bars_are_its_own(out):
     assert "Error model of gauss-newton-borders" in told["error_of_max_shear"]["source"]
     assert "fat,p95," in (out / "Load1" / "intervals.csv").read_text()
     report = (out / "report.html").read_text()
-    for sentence in ("Error model of gauss-newton-borders", "text files of elastix are not written", "strain of skin"):
+    for sentence in ("Error model of gauss-newton-borders", "No elastix text files are written", "strain of skin"):
         assert sentence in report, sentence
     given = json.loads((out / "Load1" / "provenance.json").read_text())["parameters"]
     assert given["borders"] == {"skin": None}
@@ -325,13 +325,13 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         register(**{**layers, "settings": Settings.of("heel-mr"), "start": found})
     with pytest.raises(ParameterError, match="must be above 0"):
         GaussNewtonWithInterfaces(skin=0.0)
-    with pytest.raises(ParameterError, match="borders are for the engine gauss-newton"):
+    with pytest.raises(ParameterError, match="borders is only for the engine gauss-newton"):
         engine_of(RegistrationOptions(preset="heel-mr", borders=True))
     with pytest.raises(InputError, match="borders needs a label map"):
         engine_of(RegistrationOptions(borders=True))
     for wrong, kind, said in (
         ({"bone": pad.folder / "bone.nrrd"}, InputError, "label map"),
-        (asked(pad, preset="heel-mr"), ParameterError, "borders are for"),
+        (asked(pad, preset="heel-mr"), ParameterError, "borders is only for"),
     ):
         with pytest.raises(kind, match=said):
             run(pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=tmp_path / "o", borders=True, **wrong)

@@ -81,9 +81,14 @@ def test_what_cannot_be_a_start_is_refused_first(small_pair, tmp_path):
     one, two = [tmp_path / "Load1.nii.gz"], [tmp_path / "Load1.nii.gz", tmp_path / "Load2.nii.gz"]
     for loads, given, kind, said in (
         (two, {"start": tmp_path / "theirs.h5"}, InputError, "^start is for a single loaded image, but 2 are given"),
-        (one, {"start": tmp_path / "theirs.h5", "preset": "heel-mr"}, ParameterError, "^start is for the engine"),
+        (
+            one,
+            {"start": tmp_path / "theirs.h5", "preset": "heel-mr"},
+            ParameterError,
+            "^start is only for",
+        ),
         (one, {"start": tmp_path / "theirs.h5"}, InputError, "no such transform file"),
-        (one, {"start": tmp_path / "theirs.h5", "start_frame": "RAS"}, InputError, "a transform file is in LPS"),
+        (one, {"start": tmp_path / "theirs.h5", "start_frame": "RAS"}, InputError, "transform files are always in LPS"),
         (one, {"start_frame": "RAS"}, ParameterError, "^start_frame needs start, which is not given"),
     ):
         with pytest.raises(kind, match=said):

@@ -163,7 +163,7 @@ def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path)
     with (out / "comparison" / "areas.csv").open() as file:
         assert "Load2" not in {row["load"] for row in csv.DictReader(file)}
     page = (out / "report.html").read_text()
-    assert "register Load2 failed" in page
+    assert "register Load2: failed" in page
     for file in (out / "report.html", out / "study.log", out / "provenance.json", *(out / ".study").glob("*.*")):
         assert "Doe_Jane" not in file.read_text(), file
 
@@ -254,7 +254,7 @@ def test_a_registration_whose_process_is_killed_fails_alone_and_is_named(done, t
     assert "died (exit code SIGKILL(-9))" in told
     assert not (study / "results" / "registration" / "Load1").exists()
     assert np.array_equal(shear_of(study, "Load2"), shear_of(folder, "Load2"), equal_nan=True)  # the others finish
-    assert "register Load1 failed" in (study / "results" / "report.html").read_text()
+    assert "register Load1: failed" in (study / "results" / "report.html").read_text()
     assert forecast(study, only=["register"])["register Load1"] == "run"
 
 

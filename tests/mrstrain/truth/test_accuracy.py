@@ -75,7 +75,7 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     first = accuracy(tmp_path, cases=cases[:2], workers=1, tell_plan=plans.append)
     stamp = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "runs").iterdir()}
     study = accuracy(tmp_path, cases=cases, workers=1, tell_plan=plans.append)
-    assert [p.split(", about")[0] for p in plans] == [
+    assert [p.split(": about")[0] for p in plans] == [
         "2 registrations to run (0 are already done)",
         "1 registrations to run (2 are already done)",
     ]
@@ -94,7 +94,7 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
         assert (tmp_path / name).stat().st_size > 100
     page = (tmp_path / "report.html").read_text()
     assert "Spatial resolution" in page
-    assert page.count("data:image/png") == 5
+    assert page.count("data:image/webp") == 5
 
 
 def test_a_perfect_registration_has_no_error_and_resolves_the_wave(monkeypatch: pytest.MonkeyPatch) -> None:
