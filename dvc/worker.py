@@ -102,13 +102,10 @@ def each_in_workers(items: Iterable[_I], task: Callable[[_I, Worker], None], *, 
 
 @contextmanager
 def side_by_side(what: str, at_once: int) -> Iterator[Each]:
-    """A `map` whose calls run ``at_once`` at a time, each in a process of one thread; for 1 it is `map` itself.
+    """A `map` whose calls run ``at_once`` at a time, each in a process of one thread, whose memory is given back.
 
     ``what`` the calls do in words ("comparing"); a call that fails ends the others, and its error is raised.
     """
-    if at_once < 2:
-        yield map
-        return
     with _workers(at_once, 1) as each:
         yield lambda task, items: each(lambda item, worker: worker.run(what, task, item), items)
 

@@ -90,9 +90,7 @@ def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
     return filled_from_nearest(result.deformation.displacement(points_mm), points_mm)
 
 
-def _viewer(
-    one: LoadComparison, measured: Deformation, results: Sequence[FeResult], scanned: Path | None
-) -> Viewer:  # fmt: skip
+def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResult], scanned: Path | None) -> Viewer:
     """Measured strain and that of the best model over an image, or over the label map, on its voxels."""
     labels = one.labels
     box = Mask(labels.grid, labels.labels > 0).box(_AROUND)
@@ -112,8 +110,9 @@ def _viewer(
     most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
     return Viewer(
         "Interactive 3-D viewer",
-        f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}. Drag to "
-        "move through the slices, drag with the right button to rotate; both views follow. Needs WebGL 2.",
+        f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}, over the "
+        "registered image of the first load. Drag to move through the slices, drag with the right button to rotate; "
+        "both views follow. Needs WebGL 2.",
         Volume.image("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
         (Volume.overlay("measured", grid, shear[0], most), Volume.overlay(model.name, grid, shear[1], most)),
     )

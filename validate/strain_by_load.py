@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +29,9 @@ from dvc.report.sheet import (
     Plane,
     View,
     levelled,
+    outline,
     png_bytes,
-    scale_length_mm,
+    scale_bar,
     window_of,
 )
 from validate.fe_result import FeResult
@@ -54,9 +55,7 @@ class Strip:
     max_shear: Mapping[str, Float32Array]  # by model, and as `MEASURED`; NaN where it is not defined
 
     @classmethod
-    def of(
-        cls, one: LoadComparison, measured: Deformation, results: Sequence[FeResult], point_mm: FloatArray
-    ) -> "Strip":
+    def of(cls, one: LoadComparison, measured: Deformation, results: Sequence[FeResult], point_mm: FloatArray) -> Self:
         """The slice of the label map's voxels through a point, LPS mm, nearest to the plate's normal and shear."""
         labels, scanned = one.labels, one.case.image
         across = np.abs(np.cross(one.case.axes[:, 0], one.case.axes[:, 1]))
@@ -124,7 +123,6 @@ def strain_by_load(strips: Sequence[Strip], model: str, highest: float) -> bytes
 
 
 def _paint(axes: Axes, strip: Strip, name: str, norm: Normalize) -> None:
-    left, right, bottom, top = strip.extent_mm
     how: dict[str, Any] = {"extent": strip.extent_mm, "origin": "upper", "aspect": "auto"}
     axes.imshow(strip.image, cmap="gray", vmin=0.0, vmax=1.0, **how)
     values: npt.NDArray[Any] | None = strip.max_shear.get(name)
@@ -132,12 +130,7 @@ def _paint(axes: Axes, strip: Strip, name: str, norm: Normalize) -> None:
         axes.text(0.5, 0.5, "no result", transform=axes.transAxes, ha="center", color="white", path_effects=SHADOW)
     else:
         axes.imshow(np.ma.masked_invalid(values), cmap=_COLOURS, norm=norm, interpolation="nearest", **how)
-    for mask in strip.outlines:
-        if mask.any() and not mask.all() and min(mask.shape) > 1:
-            rows, columns = mask.shape
-            x = left + (np.arange(columns) + 0.5) * (right - left) / columns
-            y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
-            axes.contour(x, y, mask.astype(float), levels=[0.5], colors=["white"], linewidths=0.8)
+    outline(axes, strip.extent_mm, strip.outlines)
 
 
 def _mark(axes: Axes, strip: Strip) -> None:
@@ -146,7 +139,4 @@ def _mark(axes: Axes, strip: Strip) -> None:
     spots = (0.015, 0.5, "left", "center"), (0.985, 0.5, "right", "center"), (0.5, 0.985, "center", "top")
     for letter, (x, y, ha, va) in zip(LETTERS[strip.plane], (*spots, (0.5, 0.015, "center", "bottom")), strict=True):
         axes.text(x, y, letter, ha=ha, va=va, weight="bold", **white, **FONT)
-    width = strip.extent_mm[1] - strip.extent_mm[0]
-    length = scale_length_mm(width)
-    axes.plot([0.04, 0.04 + length / width], [0.04, 0.04], linewidth=2.5, solid_capstyle="butt", **white)
-    axes.text(0.04, 0.055, f"{length:g} mm", va="bottom", fontsize=9, **white)
+    scale_bar(axes, strip.extent_mm[1] - strip.extent_mm[0])

@@ -283,7 +283,7 @@ class Measurement:
 
     def _repr_html_(self) -> str:
         picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
-        table = page.short_table(self.regions, self.intervals)
+        table = page.summary_table(self.regions, self.intervals)
         return notebook_html(self.name, picture, table, verdict=self.verdict, notes=self.error_bars.summary)
 
     def section(self, pictures: Mapping[str, Picture]) -> Section:

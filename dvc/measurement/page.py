@@ -128,23 +128,6 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
     return Table("Maximum shear strain by region", columns, rows, note)
 
 
-def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
-    """Median and 95th percentile of the maximum shear strain by region, each with its interval where it is known."""
-    known = {(i.region, i.figure): f"{shown(i.low)} to {shown(i.high)}" for i in intervals}
-
-    def own(region: str, figure: str) -> tuple[str, ...]:
-        return (known.get((region, figure), "–"),) if known else ()
-
-    interval = ("95 % interval",) * bool(known)
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (r.region, r.volume_ml, r.median, *own(r.region, "median"), r.p95, *own(r.region, "p95"))
-        for r in regions
-        if r.quantity == "max_shear"
-    )
-    columns = ("region", "volume, mL", "median", *interval, "95th percentile", *interval)
-    return Table("Maximum shear strain", columns, rows)
-
-
 def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
     """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known."""
     known = {(i.region, i.figure): f" ({shown(i.low)} to {shown(i.high)})" for i in intervals}

@@ -137,7 +137,7 @@ class Engine(Protocol):
     needs_labels: ClassVar[bool] = False
     """Whether it needs a label map of the tissues."""
     sees_brightness: ClassVar[bool] = True
-    """Whether a constant offset in brightness between the images misleads it; it does not mislead correlation."""
+    """Whether an offset in brightness between the images misleads it; it does not mislead correlation."""
     starts_anywhere: ClassVar[bool] = True
     """Whether it can start from any displacement; otherwise only from its own results."""
     cost: ClassVar[Cost] = Cost()

@@ -169,13 +169,7 @@ class Sheet:
 
     def outlines(self, plane: Plane, axes: Axes, pages: Iterable[BoolArray], colour: str = "white") -> None:
         """Draw the borders of masks, given as pages of this plane, as thin lines."""
-        left, right, bottom, top = self.view.extent_mm(plane)
-        for page in pages:
-            if page.any() and not page.all() and min(page.shape) > 1:
-                rows, columns = page.shape
-                x = left + (np.arange(columns) + 0.5) * (right - left) / columns
-                y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
-                axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
+        outline(axes, self.view.extent_mm(plane), pages, colour)
 
     def bar(self, shades: Colormap, norm: Normalize, label: str, extend: str = "neither") -> None:
         """Draw the one colour bar of the sheet, below the panels."""
@@ -207,11 +201,29 @@ class Sheet:
                 for letter, (x, y, ha, va) in zip(LETTERS[plane], spots, strict=True):
                     axes.text(x, y, letter, ha=ha, va=va, weight="bold", zorder=9, **white, **FONT)
                 if number == 0:
-                    length = scale_length_mm(right - left)
-                    ends = [0.03, 0.03 + length / (right - left)]
-                    axes.plot(ends, [0.035, 0.035], linewidth=2.5, solid_capstyle="butt", **white)
-                    axes.text(0.03, 0.05, f"{length:g} mm", va="bottom", fontsize=9, **white)
+                    scale_bar(axes, right - left)
         return self.figure
+
+
+def outline(
+    axes: Axes, extent_mm: tuple[float, float, float, float], pages: Iterable[BoolArray], colour: str = "white"
+) -> None:
+    """Draw the borders of masks, given as pages that fill an extent (left, right, bottom, top), as thin lines."""
+    left, right, bottom, top = extent_mm
+    for page in pages:
+        if page.any() and not page.all() and min(page.shape) > 1:
+            rows, columns = page.shape
+            x = left + (np.arange(columns) + 0.5) * (right - left) / columns
+            y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
+            axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
+
+
+def scale_bar(axes: Axes, width_mm: float) -> None:
+    """Draw a bar of a round length in the lower left corner of a panel that is so wide."""
+    white: dict[str, Any] = {"color": "white", "path_effects": SHADOW, "transform": axes.transAxes}
+    length = scale_length_mm(width_mm)
+    axes.plot([0.03, 0.03 + length / width_mm], [0.035, 0.035], linewidth=2.5, solid_capstyle="butt", **white)
+    axes.text(0.03, 0.05, f"{length:g} mm", va="bottom", fontsize=9, **white)
 
 
 def _beside(mark: float) -> float:

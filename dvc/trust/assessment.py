@@ -26,7 +26,7 @@ _LIMITS = {
         f"explains: local similarity is {{value}} below what it allows ({{limits}}{_NOISIER}). Check that both images "
         "show the same subject, scanned with the same protocol. Parallel imaging and filters change the noise in the "
         "tissue."),
-    "offset": (0.07, 0.12, 0, "%", "The images differ by a constant offset in brightness, {value} of the tissue's "
+    "offset": (0.07, 0.12, 0, "%", "The images differ by an offset in brightness, {value} of the tissue's brightness "
         f"({{limits}}{_NOISIER}). The registration takes it for motion. Scan both with the same protocol, or remove "
         "the offset from the images."),
     "voxel_mm": (2.0, 5.0, 1, " mm", "Slices are {value} apart ({limits}). Strain across slices is hardly resolved, "
