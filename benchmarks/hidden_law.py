@@ -20,6 +20,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from benchmarks.nodal import Averaged
 from dvc import (
@@ -34,7 +35,6 @@ from dvc import (
     write_labels,
 )
 from dvc.io.result_folder import spline_in
-from dvc.trust.error_model import GaussianField
 from fe import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh, run, simulate
 from mrstrain.models.simulate import LOADS
@@ -132,13 +132,11 @@ def hidden_model(work: Path, labels: LabelMap, seed: int) -> Path:
     plain = read_tet_mesh(work / "plain.vtu")
     fat = plain.regions["fat"]
     at = labels.grid.indices_of(plain.centroids_mm[fat])
-    near = np.unique(np.rint(at).astype(int), axis=0)
-    field = GaussianField(
-        labels.grid.shape, tuple(near.T), np.full(3, LOBULES_MM / 2.355 / 0.8), np.random.default_rng([seed, 77])
-    ).drawn()
-    whole = np.zeros(labels.grid.shape)
-    whole[tuple(near.T)] = field
-    values = whole[tuple(np.rint(at).astype(int).T)]
+    width = LOBULES_MM / 2.355 / 0.8
+    noise = np.random.default_rng([seed, 77]).standard_normal(
+        [n + int(np.ceil(6.0 * width)) for n in labels.grid.shape]
+    )
+    values = gaussian_filter(noise, width, mode="wrap")[tuple(np.rint(at).astype(int).T)]
     kinds = np.digitize(values, np.quantile(values, [1 / 3, 2 / 3]))
     regions = {name: cells for name, cells in plain.regions.items() if name != "fat"}
     regions |= {name: fat[kinds == k] for k, name in enumerate(("fat-soft", "fat-middle", "fat-stiff"))}

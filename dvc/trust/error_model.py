@@ -28,8 +28,10 @@ POOLED = "soft tissue"
 
 _FORMAT = 1
 _FAR = 1.6  # a table is used for voxels and noise within this factor of its own
-_LATTICE = 30_000
 _STEPS = 4  # of the lattice that noise at scattered points is drawn on, within a correlation length
+_STEPS_OF_VOXELS = 2  # of the voxels at which truths of a map are drawn
+_MOST_NODES = 500_000  # of their lattice, which is coarser where it would have more
+_FEW = 2_000  # of a tissue's voxels on it, below which all are taken
 _DRAWS = 200
 
 
@@ -222,31 +224,37 @@ class Uncertainty:
 
 
 class GaussianField:
-    """Gaussian fields of unit variance at some voxels ``at`` of a lattice, smooth over ``width`` voxels."""
+    """Gaussian fields of unit variance at points (n, 3), mm, with autocorrelation exp(-(d / correlation_mm)^2).
+
+    They are drawn at the nodes of a lattice with edges (3,), mm, from the lowest point on; each point takes the value
+    of the nearest node.
+    """
 
     def __init__(
-        self, shape: tuple[int, ...], at: tuple[IntArray, ...], width: FloatArray, random: np.random.Generator
+        self, points_mm: FloatArray, edges_mm: FloatArray, correlation_mm: float, random: np.random.Generator
     ) -> None:
-        self._at, self._width, self._random = at, width, random
+        self._random, self._width = random, 0.5 * correlation_mm / edges_mm
+        index = np.rint((points_mm - points_mm.min(axis=0)) / edges_mm).astype(np.int64)
         # Room around, so that the field, which is periodic, does not meet itself.
-        self._shape = tuple(int(n + r) for n, r in zip(shape, np.ceil(6.0 * width), strict=True))
-        spread = np.ones(())
-        for w in width:
+        self._shape = tuple((index.max(axis=0) + 1 + np.ceil(6.0 * self._width).astype(np.int64)).tolist())
+        self._at = np.ravel_multi_index(tuple(index.T), self._shape)
+        spread = 1.0
+        for w in self._width:
             kernel = gaussian_filter1d(np.eye(1, 2 * int(4 * w + 1) + 1, int(4 * w + 1))[0], w, mode="constant")
-            spread = spread * (kernel**2).sum()
-        self._scale = 1.0 / np.sqrt(float(spread))
+            spread *= float((kernel**2).sum())
+        self._scale = 1.0 / np.sqrt(spread)
 
     def drawn(self) -> FloatArray:
-        """Draw the values at the region's voxels, (n,)."""
+        """Draw the values at the points, (n,)."""
         smooth = gaussian_filter(self._random.standard_normal(self._shape), self._width, mode="wrap")
-        return np.asarray(self._scale * smooth[self._at])
+        return np.asarray(self._scale * smooth.ravel()[self._at])
 
 
 class TruthDraws:
     """Draws of the truth, as `uncertainty_of` makes them on a grid.
 
-    At points (n, 3) of the reference configuration, LPS mm: maximum shear strain, tissue and
-    distance to bone, each (n,).
+    At points (n, 3) of the reference configuration, mm: maximum shear strain, tissue and distance to bone, each (n,).
+    Noise is drawn on a lattice with ``edges_mm`` (3,), by default a quarter of the table's correlation length.
     """
 
     def __init__(
@@ -257,22 +265,21 @@ class TruthDraws:
         to_bone_mm: FloatArray,
         table: ErrorTable,
         seed: int = 1,
+        edges_mm: FloatArray | None = None,
     ) -> None:
         self._random = np.random.default_rng(seed)
         self._shear = shear
-        names = self._names = np.asarray(tissue)
+        names = np.asarray(tissue)
+        self._tissues = {str(name): names == name for name in np.unique(names)}
         self._expected = []
         for run in range(len(table.runs)):
             bias, sd = np.empty((2, len(shear)))
-            for name in np.unique(names):
-                here = names == name
-                bias[here], sd[here] = table.expected(str(name), shear[here], to_bone_mm[here], run)
+            for name, here in self._tissues.items():
+                bias[here], sd[here] = table.expected(name, shear[here], to_bone_mm[here], run)
             self._expected.append((bias, sd))
         self._variance = np.mean([sd**2 for _, sd in self._expected], axis=0)
-        step = table.correlation_mm / _STEPS
-        index = np.rint((points_mm - points_mm.min(axis=0)) / step).astype(np.int64)
-        width = np.full(3, 0.5 * table.correlation_mm / step)
-        self._noise = GaussianField(tuple(int(n) + 1 for n in index.max(axis=0)), tuple(index.T), width, self._random)
+        edges = np.full(3, table.correlation_mm / _STEPS) if edges_mm is None else edges_mm
+        self._noise = GaussianField(points_mm, edges, table.correlation_mm, self._random)
 
     def drawn(self) -> FloatArray:
         """A truth (n,): the shear less a registration's bias, less a Gaussian field of its deviation; not below 0."""
@@ -287,8 +294,7 @@ class TruthDraws:
         all of the spread.
         """
         narrow = np.empty(len(truth))
-        for name in np.unique(self._names):
-            here = self._names == name
+        for here in self._tissues.values():
             mean, spread = truth[here].mean(), truth[here].var()
             kept = max(spread - 2.0 * self._variance[here].mean(), 0.0) / spread if spread > 0.0 else 0.0
             narrow[here] = mean + np.sqrt(kept) * (truth[here] - mean)
@@ -310,44 +316,55 @@ def uncertainty_of(
     For each of the soft tissues ``regions``, masks by name, at distances to bone (ni, nj, nk). Beside
     `ErrorTable.widening`, ``wider`` holds factors on the deviation and the intervals of some regions.
 
-    The truth is drawn 200 times: measured shear, less the bias of one of the study's registrations, drawn anew each
-    time, less a Gaussian field of its standard deviation and of the table's correlation length; not below zero. The
-    interval of the draws is widened by a factor from held-out heels (conformal prediction), so that it holds in 95 % of
-    cases like those of the study.
+    The truth is drawn 200 times for all tissues at once: measured shear, less the bias of one of the study's
+    registrations, drawn anew each time, less a Gaussian field of its standard deviation and of the table's correlation
+    length; not below zero. The interval of the draws is widened by a factor from held-out heels (conformal prediction),
+    so that it holds in 95 % of cases like those of the study.
     """
     sigma = np.full(grid.shape, np.nan, dtype=np.float32)
-    intervals, random = list[Interval](), np.random.default_rng(seed)
+    measured = {name: inside & np.isfinite(max_shear) for name, inside in regions.items()}
+    measured = {name: where for name, where in measured.items() if where.any()}
+    if not measured:
+        return Uncertainty(sigma, (), table)
+    body, about = np.any(list(measured.values()), axis=0), table.correlation_mm / _STEPS_OF_VOXELS / grid.spacing_mm
+    apart = _voxels_apart(body, about)
+    at = [_some_of(where, apart) for where in measured.values()]
+    every = tuple(np.concatenate(axis) for axis in zip(*at, strict=True))
+    ends = np.cumsum([len(some[0]) for some in at])
+    tissue = np.repeat(list(measured), np.diff(ends, prepend=0)).tolist()
+    points = np.stack(every, axis=1) * grid.spacing_mm
+    shear_there, edges = max_shear[every].astype(np.float64), np.array(apart) * grid.spacing_mm
+    draws = TruthDraws(points, shear_there, tissue, to_bone_mm[every], table, seed, edges)
+    volumes = [np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0 for where in measured.values()]
+    drawn = []
+    for _ in range(_DRAWS):
+        truths = np.split(draws.drawn(), ends[:-1])
+        drawn.append([figures_of(truth, volume) for truth, volume in zip(truths, volumes, strict=True)])
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS)]
-    for name, inside in regions.items():
-        where = inside & np.isfinite(max_shear)
-        if not where.any():
-            continue
+    intervals = []
+    for (name, where), volume, figures in zip(measured.items(), volumes, np.swapaxes(drawn, 0, 1), strict=True):
         shear, factor = max_shear[where].astype(np.float64), wider.get(name, 1.0)
         sigma[where] = factor * table.expected(name, shear, to_bone_mm[where])[1]
-        volume = shear.size * grid.voxel_volume_mm3 / 1000.0
-        lattice, step = _lattice(where)
-        kept = where[lattice]
-        found, distance = max_shear[lattice][kept].astype(np.float64), to_bone_mm[lattice][kept]
-        width = 0.5 * table.correlation_mm / (step * grid.spacing_mm)
-        noise = GaussianField(kept.shape, np.nonzero(kept), width, random)
-        expected = [table.expected(name, found, distance, run) for run in range(len(table.runs))]
-        drawn = []
-        for _ in range(_DRAWS):
-            bias, sd = expected[random.integers(len(expected))]
-            drawn.append(figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume))
-        low, middle, high = widened(np.array(drawn), factor * table.factor)
+        low, middle, high = widened(figures, factor * table.factor)
         high[3:] = np.minimum(high[3:], volume)
         each = zip(names, figures_of(shear, volume), middle, low, high, strict=True)
         intervals += [Interval(name, figure, *map(float, numbers)) for figure, *numbers in each]
     return Uncertainty(sigma, tuple(intervals), table)
 
 
-def _lattice(where: BoolArray) -> tuple[tuple[slice, ...], int]:
-    """Every so many voxels of a mask's box, few enough for draws to be quick, or all where these miss the mask."""
-    box = tuple(slice(int(a.min()), int(a.max()) + 1) for a in np.nonzero(where))
-    step = max(1, int(np.ceil((np.count_nonzero(where) / _LATTICE) ** (1 / 3))))
-    lattice = tuple(slice(b.start, b.stop, step) for b in box)
-    return (lattice, step) if where[lattice].any() else (box, 1)
+def _voxels_apart(body: BoolArray, about: FloatArray) -> list[int]:
+    """How many voxels apart truths are drawn along each axis: ``about`` (3,), or more in a large body."""
+    extent = [np.ptp(np.flatnonzero(body.any(axis=tuple({0, 1, 2} - {axis})))) + 1 for axis in range(3)]
+    larger = (float(np.prod(extent / np.maximum(about, 1.0))) / _MOST_NODES) ** (1 / 3)
+    return [max(1, round(max(1.0, larger) * voxels)) for voxels in about]
+
+
+def _some_of(where: BoolArray, apart: Sequence[int]) -> tuple[IntArray, ...]:
+    """Indices of a mask's voxels on the lattice of every so many, or of all where these are few."""
+    i, j, k = apart
+    on_lattice = np.zeros_like(where)
+    on_lattice[::i, ::j, ::k] = where[::i, ::j, ::k]
+    return np.nonzero(on_lattice if np.count_nonzero(on_lattice) >= _FEW else where)
 
 
 def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float] = SHEAR_THRESHOLDS) -> FloatArray:

@@ -15,6 +15,7 @@ from dvc.trust.error_model import (
     POOLED,
     ErrorModel,
     ErrorTable,
+    GaussianField,
     figures_of,
     read_error_model,
     to_surface_mm,
@@ -114,6 +115,17 @@ def test_intervals_of_small_regions_are_as_wide_as_a_voxels_error(shape: tuple[i
     assert median.estimate == pytest.approx(0.245, abs=0.01)
     assert 0.6 * 0.0588 < median.high - median.estimate < 1.4 * 0.0588
     assert 0.6 * 0.0588 < median.estimate - median.low < 1.4 * 0.0588
+
+
+def test_drawn_errors_are_as_alike_as_the_correlation_length_says() -> None:
+    """Unit variance, and exp(-(d / c)^2) at a distance d, on lattice nodes of a body of thin voxels."""
+    away = np.array([0.0, 0.5, 1.0, 1.5, 4.0]) * 3.0
+    starts = np.stack(np.meshgrid(*[np.arange(0.0, 40.0, 4.5)] * 3), axis=-1).reshape(-1, 3)
+    points = np.concatenate([starts + np.array([d, 0.0, 0.0]) for d in away])
+    field = GaussianField(points, np.array([1.5, 0.5, 0.75]), 3.0, np.random.default_rng(11))
+    drawn = np.array([field.drawn().reshape(5, -1) for _ in range(100)])
+    alike = np.mean(drawn[:, :1] * drawn, axis=(0, 2))
+    np.testing.assert_allclose(alike, np.exp(-((away / 3.0) ** 2)), atol=0.015)
 
 
 def test_sigma_lies_where_the_shear_is_known_and_nowhere_else() -> None:
