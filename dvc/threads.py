@@ -7,6 +7,8 @@ platforms do not allow from several threads of Python at once.
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from queue import Empty, SimpleQueue
 
 _PARTS = 4  # for each thread: what one part takes longer, another makes up for
 
@@ -21,7 +23,8 @@ class _Threads:
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self.pool = ThreadPoolExecutor(count, "compiled")  # starts its threads when there is work
+        # Beside the caller's own; starts them when there is work.
+        self.pool = ThreadPoolExecutor(max(1, count - 1), "compiled")
 
 
 def _asked() -> int:
@@ -50,7 +53,8 @@ def in_parts(kernel: Callable[..., None], size: int, *arguments: object) -> None
     """Run ``kernel(start, stop, *arguments)`` for parts that make up range(size), on all threads.
 
     A kernel lets go of the interpreter (`nogil`), and writes for each number of its range what no other does: the
-    result is the same bit for bit on any number of threads.
+    result is the same bit for bit on any number of threads. The caller's thread takes parts too, and has done what is
+    short before another wakes.
     """
     threads = _threads[-1]
     parts = min(size, _PARTS * threads.count) if threads.count > 1 else 1
@@ -58,4 +62,20 @@ def in_parts(kernel: Callable[..., None], size: int, *arguments: object) -> None
         kernel(0, size, *arguments)
         return
     ends = [size * part // parts for part in range(parts + 1)]
-    list(threads.pool.map(lambda part: kernel(ends[part], ends[part + 1], *arguments), range(parts)))
+    left = SimpleQueue[int]()
+    for part in range(parts):
+        left.put(part)
+
+    def take() -> None:
+        with suppress(Empty):
+            while True:
+                part = left.get_nowait()
+                kernel(ends[part], ends[part + 1], *arguments)
+
+    others = [threads.pool.submit(take) for _ in range(min(threads.count, parts) - 1)]
+    try:
+        take()
+    finally:
+        for other in others:
+            if not other.cancel():
+                other.result()

@@ -181,13 +181,18 @@ class _Run:
 
     def all(self, at_once: int, chain: bool) -> None:
         last: list[Deformation] = []
+        names = sorted(self.images, key=lambda name: name != REPEAT)  # its floor is waited for
+        not_begun = set(names)
 
         def one(name: str, worker: Worker) -> None:
+            not_begun.remove(name)
             is_repeat = name == REPEAT
             start = None if is_repeat else last[-1] if chain and last else self.start
             told = partial(self._told, name)
             try:
                 done = self.plan.register(name, self.images[name], start, worker, told)
+                if not not_begun:
+                    worker.close()  # its memory is as large as what the maps take now
                 if not is_repeat:
                     last.append(done[0].displacement)
                     self._floor_known.wait()
@@ -202,7 +207,6 @@ class _Run:
                 if is_repeat:
                     self._floor_known.set()
 
-        names = sorted(self.images, key=lambda name: name != REPEAT)  # its floor is waited for
         each_in_workers(names, one, at_once=at_once, threads=self.plan.settings.threads)
 
     def finished(self) -> tuple[Case, ...]:
