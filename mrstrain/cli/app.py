@@ -14,12 +14,19 @@ import typer
 from mrstrain.cli import measurement, models, studies
 from mrstrain.cli.options import EXAMPLES, Grouped
 
+_GREETING = """\
+mrstrain measures strain inside soft tissue from pairs of MR images, and compares finite-element models with it.
+
+  mrstrain demo       see it work: a phantom heel, from images to report, in a few minutes
+  mrstrain register   measure strain between your own images, unloaded and loaded
+  mrstrain compare    compare finite-element models with the strain that was measured
+
+mrstrain --help lists all commands, and mrstrain COMMAND --help the options of one."""
 _M_ARENA_MAX = -8  # of glibc's malloc.h
 
 app = typer.Typer(
     name="mrstrain",
     help="Measure strain inside soft tissue from pairs of MR images, and compare finite-element models with it.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -34,13 +41,15 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    pass
+    if context.invoked_subcommand is None:
+        typer.echo(_GREETING)
 
 
 for _command in (
