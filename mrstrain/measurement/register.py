@@ -63,10 +63,16 @@ def register(
     _check_start(scans, chosen)
     given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
     refuse_touching_inputs(target, cases, [load0, *paths, *given])
-    subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
     align = registration.align
-    if align == "bone" and subject.bone is None:
-        raise InputError("Alignment on bone needs a bone: give bone or bone_label, or use align image or none.")
+    if align == "bone" and subject_files.bone is None and subject_files.bone_label is None:
+        raise InputError(
+            "The images are aligned on a rigid bone, and none is given.\n"
+            f"In ITK-SNAP or 3D Slicer, segment the bone of the body part (in a heel, the calcaneus) on {load0.name}, "
+            "save it as NIfTI, and pass it as bone (--bone); or pass a label map and the name of its bone, as labels "
+            "and bone_label (--labels, --bone-label).\n"
+            "If the images show no bone, use align image (--align image)."
+        )
+    subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
     images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
     # Read now: what is wrong with it must not be found after an hour.
     model = None if registration.error_model is None else read_error_model(registration.error_model)

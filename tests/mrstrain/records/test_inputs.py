@@ -11,6 +11,7 @@ import pytest
 from dvc.errors import MrstrainError
 from dvc.images.image import Grid, Image
 from dvc.io.images.write import write_image
+from mrstrain.measurement.register import register
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
 from mrstrain.studies.run import run_studies
@@ -24,9 +25,18 @@ def test_arguments_are_named_without_the_dashes_of_the_command_line(tmp_path: Pa
         (lambda: case_names([image, tmp_path / "other" / "Load0.nii.gz"]), r"\(out\)"),
         (lambda: refuse_touching_inputs(tmp_path, ["a"], [tmp_path / "a" / "b.nii"]), r"\(out\)"),
         (lambda: refuse_small_disk(tmp_path, 1e30, "images need"), r"\(out\)"),
+        (lambda: register(image, [tmp_path / "Load1.nii.gz"], out=tmp_path / "out"), r"bone \(--bone\)"),
         (lambda: make_output(image / "below"), r"\(out\)"),
         (lambda: run_studies([], scheduler="tcp://n:1", workers=4), r"workers=4 \(--workers 4\)"),
     ):
         with pytest.raises(MrstrainError, match=names) as told:
             refused()
         assert "--" not in re.sub(r"\(--.*?\)", "", str(told.value))
+
+
+def test_without_a_bone_three_lines_tell_how_to_get_one(tmp_path: Path) -> None:
+    with pytest.raises(MrstrainError) as told:
+        register(tmp_path / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "out")
+    assert len(str(told.value).splitlines()) <= 3
+    for words in ("ITK-SNAP or 3D Slicer", "calcaneus", "on Load0.nii.gz", "NIfTI", "(--bone)", "(--align image)"):
+        assert words in str(told.value)
