@@ -95,8 +95,7 @@ class ResultFolder:
 
 def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]:
     """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is; all, or those named."""
-    folders = [place] if (place / DISPLACEMENT).is_file() else sorted(p.parent for p in place.glob(f"*/{DISPLACEMENT}"))
-    folders = [f for f in folders if f == place or f.name != REPEAT]
+    folders = _folders(place)
     if not folders:
         what = f"no results of `mrstrain register` or `strain` in this folder (LOAD/{DISPLACEMENT})"
         raise InputError(f"{place}: {what}. Pass the folder that they wrote.")
@@ -105,6 +104,16 @@ def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]
     if absent:
         raise InputError(f"{place} has no results of {', '.join(absent)}.")
     return [ResultFolder.at(folder) for folder, name in zip(folders, names, strict=True) if not loads or name in loads]
+
+
+def holds_results(place: Path) -> bool:
+    """Whether this is a folder that `register` or `strain` wrote, of all loads or of one."""
+    return bool(_folders(place))
+
+
+def _folders(place: Path) -> list[Path]:
+    folders = [place] if (place / DISPLACEMENT).is_file() else sorted(p.parent for p in place.glob(f"*/{DISPLACEMENT}"))
+    return [f for f in folders if f == place or f.name != REPEAT]
 
 
 def spline_in(folder: Path) -> Deformation:

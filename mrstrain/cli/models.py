@@ -67,8 +67,8 @@ def compare(
         list[Path],
         typer.Argument(help="One folder per model, with one file per load (Load1.vtu, .frd, .csv ...)."),
     ],
-    out: Out, labelling: modelling.LabelMapFile, reading: modelling.ModelReading, directions: modelling.Directions,
-    comparison: modelling.ComparisonOn,
+    out: Out, labelling: modelling.ComparisonLabels, reading: modelling.ModelReading,
+    directions: modelling.ComparisonDirections, comparison: modelling.ComparisonOn,
     to_image: Annotated[
         Path | None,
         typer.Option(
@@ -98,7 +98,9 @@ def drive(
 
 @takes_options
 def level(
-    load0: Annotated[Path, typer.Argument(help="The unloaded image.")],
+    dvc: Annotated[
+        Path, typer.Argument(help="Results folder of register, with its settings; or the unloaded image alone.")
+    ],
     model: Annotated[Path, typer.Argument(help="Folder of a model with one file per load, as in compare.")],
     out: Out, subject_files: SubjectFiles, engine: EngineOptions, reading: modelling.ModelReading, seeded: Seeded,
     load: Annotated[
@@ -110,7 +112,7 @@ def level(
 ) -> None:  # fmt: skip
     """Forward-model comparison: warp the image by a model's displacement, and register it like the real pair."""
     carry_out(
-        mrstrain.level.with_options, load0, model, out=out, subject_files=subject_files, loads=load or (),
+        mrstrain.level.with_options, dvc, model, out=out, subject_files=subject_files, loads=load or (),
         engine=engine, reading=reading, seeded=seeded,
     )  # fmt: skip
 

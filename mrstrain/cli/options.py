@@ -35,7 +35,8 @@ EXAMPLES = {
     for command, given in {
         "register": "Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --out results",
         "simulate": "heel.vtu --set trebbi --load Load1=115 --out simulated",
-        "compare": "results simulated/trebbi --labels tissues.nii.gz --names tissues.csv --out compared",
+        "compare": "results simulated/trebbi --out compared",
+        "level": "results simulated/trebbi --out levelled",
     }.items()
 }
 """The end of a command's help, by command."""

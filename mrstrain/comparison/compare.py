@@ -15,12 +15,13 @@ from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, 
 from dvc.report.page import Section
 from dvc.threads import usable_cores
 from dvc.worker import side_by_side
-from fe import read_tet_mesh
+from fe import BONE, read_tet_mesh
+from mrstrain.comparison.from_record import fill_directions, fill_labels, taken_from_record
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, model_files
 from mrstrain.options.door import door
 from mrstrain.options.model import Vector
-from mrstrain.options.modelling import ComparisonOn, Directions, LabelMapFile, ModelReading
+from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.progress import OnProgress
@@ -37,20 +38,23 @@ class Compared:
     comparison: validate.Comparison
     sections: tuple[Section, ...]
     closing: tuple[Section, ...]
+    taken: tuple[str, ...] = ()  # a line on what was taken from the record of the measurement
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
-        return [*self.comparison.summary(), f"Report: {self.out / REPORT}"]
+        return [*self.taken, *self.comparison.summary(), f"Report: {self.out / REPORT}"]
 
 
 @door
 def compare(
-    dvc: Path | str, models: Sequence[Path | str], *, out: Path | str, labelling: LabelMapFile,
-    loads: Sequence[str] = (), reading: ModelReading, to_image: FloatArray | None = None, directions: Directions,
-    towards: Mapping[str, tuple[Vector, Vector]] | None = None, comparison: ComparisonOn,
-    progress: OnProgress | None = None,
+    dvc: Path | str, models: Sequence[Path | str], *, out: Path | str, labelling: ComparisonLabels,
+    loads: Sequence[str] = (), reading: ModelReading, to_image: FloatArray | None = None,
+    directions: ComparisonDirections, towards: Mapping[str, tuple[Vector, Vector]] | None = None,
+    comparison: ComparisonOn, progress: OnProgress | None = None,
 ) -> Compared:  # fmt: skip
     """Compare finite-element models of any code with a measurement; see `validate.compare`.
+
+    Label map, names, bone and the plate's directions are those of the measurement's record unless they are given.
 
     Parameters
     ----------
@@ -74,14 +78,20 @@ def compare(
     Raises
     ------
     InputError
-        If measurement and models have no load in common, or as in `validate.compare`.
+        If measurement and models have no load in common, an input that is not given is not found as it was measured
+        with, or as in `validate.compare`.
     """
-    target, tell, tissues = Path(out), progress or (lambda *_: None), read_labels(labelling.labels, labelling.names)
+    target, tell, measurements = Path(out), progress or (lambda *_: None), result_folders(Path(dvc), loads)
+    labelling, labels_given = fill_labels(labelling, measurements), labelling
+    assert labelling.labels is not None
+    tissues, bones = read_labels(labelling.labels, labelling.names), labelling.bones or (BONE,)
     thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
     criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
-    bones, usual = labelling.bones, _axes(directions.plate_normal, directions.shear_direction)
-    own = {load: _axes(*of) for load, of in (towards or {}).items()}
-    measurements = result_folders(Path(dvc), loads)
+    usual, of_load = fill_directions(directions, measurements)
+    more = [f"(and the plate's directions of {', '.join(of_load)})"] if of_load else []
+    taken = taken_from_record(Path(dvc), (labels_given, labelling), (directions, usual), more=more)
+    pairs = {load: (of.plate_normal, of.shear_direction) for load, of in of_load.items()} | dict(towards or {})
+    axes, own = _axes(usual.plate_normal, usual.shear_direction), {load: _axes(*of) for load, of in pairs.items()}
     files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], reading, to_image)
     results = [file for of in files.values() for file in of]
     inputs = {
@@ -96,10 +106,10 @@ def compare(
         raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
     common = None if comparison.mesh is None else _common_mesh(comparison.mesh, tissues, bones)
     compared = {m.load: m for m in measurements if m.load in files}
-    cases = [_case(m, files[load], tissues.grid, own.get(load, usual)) for load, m in compared.items()]
+    cases = [_case(m, files[load], tissues.grid, own.get(load, axes)) for load, m in compared.items()]
     given = {
-        "bones": list(bones), "plate_axes_lps": usual.tolist(), "strains": list(criteria.strains),
-        "plate_axes_lps_of": {load: axes.tolist() for load, axes in own.items()}, "least_cluster_ml": criteria.least_ml,
+        "bones": list(bones), "plate_axes_lps": axes.tolist(), "strains": list(criteria.strains),
+        "plate_axes_lps_of": {load: of.tolist() for load, of in own.items()}, "least_cluster_ml": criteria.least_ml,
         "thresholds": [[t.max_shear, t.source] for t in thresholds], **reading.model_dump(exclude={"model_mesh"}),
         "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": criteria.seed,
         "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
@@ -117,7 +127,7 @@ def compare(
         said = methods(folders, of_models, result, criteria)
         parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
     share(1.0)
-    return Compared(target, result, *parts)
+    return Compared(target, result, *parts, taken)
 
 
 def _at_once(loads: int) -> int:

@@ -8,8 +8,9 @@ import numpy as np
 from dvc import Image, Subject, TetMesh, tissue_mask, write_image
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
-from dvc.io.result_folder import PROVENANCE, result_folders
+from dvc.io.result_folder import PROVENANCE, holds_results, result_folders
 from fe import write_tet_mesh
+from mrstrain.comparison.from_record import fill_engine, fill_subject, taken_from_record
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
@@ -17,6 +18,7 @@ from mrstrain.options import measurement as options
 from mrstrain.options.door import door
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.measured_with import MeasuredWith
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
@@ -28,7 +30,7 @@ _CHANGED_MM, _FEW = 0.1, 0.01
 
 @door
 def level(
-    load0: Path | str, model: Path | str, *, out: Path | str, subject_files: options.SubjectFiles,
+    dvc: Path | str, model: Path | str, *, out: Path | str, subject_files: options.SubjectFiles,
     loads: Sequence[str] = (), engine: options.EngineOptions, reading: ModelReading, seeded: options.Seeded,
     progress: OnProgress | None = None,
 ) -> Outcome:  # fmt: skip
@@ -36,8 +38,9 @@ def level(
 
     Parameters
     ----------
-    load0 : path
-        The unloaded image.
+    dvc : path
+        Results of `register`, or one of its loads: the unloaded image, and what is known of it, and the engine are then
+        those of its record unless they are given. Or the unloaded image, with all else given.
     model, reading
         A folder with a file for each load, and how it is read; as in `compare`.
     out : path
@@ -53,13 +56,17 @@ def level(
     Raises
     ------
     InputError
-        If image, bone or model cannot be used, or the model folds; before anything is registered.
+        If image, bone or model cannot be used, an input of the measurement is not found as it was, or the model folds;
+        before anything is registered.
     RegistrationError
         If no load could be registered.
     """
-    target, place = Path(out), Path(model)
+    target, place, load0 = Path(out), Path(model), Path(dvc)
+    taken: tuple[str, ...] = ()
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
+    if holds_results(load0):
+        load0, subject_files, engine, taken = _from_record(load0, subject_files, engine)
     # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
     volume = volume_kept(engine)
     how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
@@ -68,7 +75,7 @@ def level(
     of_load, notes = model_files(list(loads) or loads_of(place, reading.model_mesh is not None), [place], reading)
     files = {load: file for load, (file,) in of_load.items()}
     name = place.resolve().name + LEVELLED
-    inputs = [Path(load0), *(p for of in (subject_files, engine, reading) for p in of.paths)]
+    inputs = [load0, *(p for of in (subject_files, engine, reading) for p in of.paths)]
     refuse_touching_inputs(target, [name, f"{name}-work"], [*inputs, *(f.path for f in files.values())])
     results = {load: file.read(subject.reference.grid) for load, file in files.items()}
     images, smoothed = _warped_images(subject, results, seeded.seed)
@@ -92,7 +99,21 @@ def level(
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
     told = f"Levelled model, for compare: {target / name}"
-    return Outcome(target / name, (*notes, *smoothed, *failures, told))
+    return Outcome(target / name, (*taken, *notes, *smoothed, *failures, told))
+
+
+def _from_record(
+    dvc: Path, files: options.SubjectFiles, engine: options.EngineOptions
+) -> tuple[Path, options.SubjectFiles, options.EngineOptions, tuple[str, ...]]:
+    """The unloaded image of a measurement, its files and engine unless given, and a line on what was taken."""
+    instead = "the unloaded image in place of the results, with the options of the measurement"
+    record = MeasuredWith.shared(result_folders(dvc), instead)
+    load0 = record.file("load0", instead)
+    if load0 is None:
+        raise InputError(f"{record.path} does not tell the unloaded image. Give {instead}.")
+    of_subject, of_engine = fill_subject(files, record), fill_engine(engine, record)
+    taken = taken_from_record(dvc, (files, of_subject), (engine, of_engine), more=[str(load0)])
+    return load0, of_subject, of_engine, taken
 
 
 def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int) -> tuple[dict[str, Image], list[str]]:

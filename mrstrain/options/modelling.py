@@ -27,11 +27,18 @@ class Labelling(Options):
     the lowest point of the first bone."""
 
 
-class LabelMapFile(Labelling):
-    """A label map, and what its labels are."""
+class ComparisonLabels(Options):
+    """The label map by which tissues are compared, and what its labels are."""
 
-    labels: Path
-    """Label map of the unloaded image."""
+    panel: ClassVar[str] = "Inputs"
+
+    labels: Path | None = None
+    """Label map of the unloaded image. Default: that of the measurement, with its names and bone."""
+    names: Path | None = None
+    """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, without --labels."""
+    bones: Annotated[Names, Cli("--bone")] = ()
+    """Name of a bone label, which is not compared; slices in figures go through the lowest point of the first bone.
+    Default: the bone label of the measurement, without --labels; else bone."""
 
 
 class Finer(NamedTuple):
@@ -74,6 +81,17 @@ class Directions(Options):
     """Outward normal of the plate, away from the body, LPS. Default: 0 0 -1 (inferior)."""
     shear_direction: Vector = (0.0, -1.0, 0.0)
     """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior)."""
+
+
+class ComparisonDirections(Options):
+    """Where the plate lay, and where it sheared, in the measurement."""
+
+    panel: ClassVar[str] = "Model"
+
+    plate_normal: Vector | None = None
+    """Outward normal of the plate, away from the body, LPS. Default: that of the measurement, or 0 0 -1 (inferior)."""
+    shear_direction: Vector | None = None
+    """Direction of the shear force on the tissue, LPS. Default: that of the measurement, or 0 -1 0 (anterior)."""
 
 
 class HeelShape(Options):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,15 +12,18 @@ import meshio
 import numpy as np
 import pytest
 
+from dvc import load_preset
 from dvc.deformation.nodal import OnMesh
 from dvc.deformation.protocol import evaluate_on_grid
 from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Mask
 from dvc.io.images.write import write_image, write_mask
+from dvc.io.result_folder import write_displacement
 from dvc.mesh import TetMesh
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.comparison.level import level
-from mrstrain.options.measurement import RegistrationOptions
+from mrstrain.options.measurement import RegistrationOptions, SubjectFiles
+from mrstrain.records.provenance import provenance
 from phantoms import heel_grid, labels_of, scan
 from tests.blocks import block
 from tests.quick import QUICK
@@ -122,6 +127,35 @@ def test_what_comes_back_is_the_model_as_the_measurement_shows_it(bumped: Bumped
     size, apart = (np.linalg.norm(v, axis=1)[body & moved] for v in (u, back.deformation.u_mm - u))
     assert np.median(apart) < 0.5 * np.median(size)  # voxels of 1.6 mm
     assert np.corrcoef(back.deformation.u_mm[body & moved, 1], u[body & moved, 1])[0, 1] > 0.8
+
+
+def test_levelling_takes_image_bone_and_engine_from_the_measurement(
+    bumped: Bumped, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, measured = bumped.folder, bumped.folder / "measured" / "Load1"
+    measured.mkdir(parents=True)
+    write_displacement(measured, bumped.grid, np.zeros((*bumped.grid.shape, 3), dtype=np.float32))
+    given = {"load0": folder / "Load0.nii.gz", "bone": folder / "bone.nii.gz"}
+    stages = [{"name": "heel-mr", "text": load_preset("heel-mr").text}]
+    record = provenance("register", given, {"engine": "elastix", "stages": stages})
+    (measured / "provenance.json").write_text(json.dumps(record))
+    asked = []
+
+    def registers(load0: Path, _: object, *, out: Path, **options: object) -> None:
+        asked.append((load0, options["subject_files"], options["registration"]))
+        shutil.copytree(measured, out / "Load1")
+
+    monkeypatch.setattr("mrstrain.comparison.level.register", SimpleNamespace(with_options=registers))
+    done = level(measured.parent, folder / "model", out=folder / "out")
+    ((load0, files, how),) = asked
+    assert (load0, files, how.preset) == (given["load0"], SubjectFiles(bone=given["bone"]), "heel-mr")
+    told = json.loads((done.out / "provenance.json").read_text())
+    assert {role: told["inputs"][role] for role in given} == record["inputs"]
+    assert told["parameters"]["preset"] == "heel-mr"
+    assert done.lines[0].startswith(f"From the record of {measured.parent}: --bone ")
+    given["load0"].unlink()
+    with pytest.raises(InputError, match=r"unloaded image Load0.nii.gz .* in place of the results"):
+        level(measured.parent, folder / "model", out=folder / "out")
 
 
 def test_what_cannot_be_levelled_is_refused(bumped: Bumped, monkeypatch: pytest.MonkeyPatch) -> None:

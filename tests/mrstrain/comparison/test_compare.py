@@ -21,6 +21,7 @@ from dvc.io.images.write import write_labels
 from dvc.io.result_folder import write_displacement
 from mrstrain.cli.app import app
 from mrstrain.comparison.compare import compare
+from mrstrain.records.provenance import file_hash, provenance
 from tests.validate.test_comparison import cube, error_table, labels, sheared
 
 LOADS = {"Load1": 0.8, "Load2": 0.4}
@@ -275,6 +276,27 @@ def test_the_command_takes_one_load_and_one_file(study: Path) -> None:
     assert ran.exit_code == 0, ran.output
     assert "Load1: area between curves, mL, best first: half" in ran.output
     assert (out / "report.html").is_file()
+
+
+def test_what_was_measured_with_is_not_asked_for_again(study: Path) -> None:
+    load = study / "measured" / "Load1"
+    files = {"labels": study / "tissues.nii.gz", "names": study / "tissues.csv"}
+    axes = {"plate_normal_lps": (1.0, 0.0, 0.0), "shear_direction_lps": (0.0, 1.0, 0.0)}
+    (load / "provenance.json").write_text(json.dumps(provenance("register", files, axes | {"bone_label": "bone"})))
+    argv = ["compare", load, study / "half" / "Load1.vtu", "--out", study / "one"]
+    ran = CliRunner().invoke(app, [str(a) for a in argv])
+    assert ran.exit_code == 0, ran.output
+    (taken,) = [line for line in ran.output.splitlines() if line.startswith(f"From the record of {load}: ")]
+    assert f"--labels {study / 'tissues.nii.gz'} --names {study / 'tissues.csv'} --bone bone " in taken
+    assert taken.endswith(" --plate-normal 1 0 0 --shear-direction 0 1 0")
+    told = json.loads((study / "one" / "comparison.json").read_text())
+    for role, path in files.items():  # as if they had been given
+        assert told["inputs"][role] == [{"name": path.name, "sha256": file_hash(path)}]
+    assert np.array(told["parameters"]["plate_axes_lps"])[:, :2].T.tolist() == [[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    files["labels"].write_bytes(b"another")
+    ran = CliRunner().invoke(app, [str(a) for a in argv])
+    assert isinstance(ran.exception, InputError)
+    assert "(--labels)" in str(ran.exception)
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_written(study: Path) -> None:

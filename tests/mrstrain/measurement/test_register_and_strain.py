@@ -24,11 +24,16 @@ from dvc.images.similarity import local_correlation
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels, write_mask
 from dvc.io.meshes.write import VERDICT_FIELD
+from dvc.io.result_folder import result_folders
 from dvc.io.transforms.read import read_transform
 from dvc.threads import usable_cores
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
+from mrstrain.comparison.from_record import fill_engine, fill_labels, fill_subject
 from mrstrain.measurement.register import register
 from mrstrain.measurement.strain import strain
+from mrstrain.options.measurement import EngineOptions, SubjectFiles
+from mrstrain.options.modelling import ComparisonLabels
+from mrstrain.records.measured_with import MeasuredWith
 from tests.quick import QUICK
 
 PATIENT = "Doe^Jane"
@@ -109,6 +114,18 @@ def test_error_bars_are_those_of_the_model(results, study, tiny_pair):
     told = json.loads((folder / "quality.json").read_text())["error_of_max_shear"]
     assert told["known"] is True
     assert "made up" in (study / "out" / "report.html").read_text()
+
+
+def test_its_record_tells_later_commands_what_it_was_made_with(results, study):
+    (load,) = result_folders(study / "out")
+    record = MeasuredWith.shared([load], "")
+    assert record.file("load0") == study / "Load0.nii.gz"
+    files = {"bone": study / "bone.nii.gz", "labels": study / "tissues.nrrd", "names": study / "tissues.csv"}
+    assert fill_subject(SubjectFiles(), record) == SubjectFiles(**files)
+    assert fill_engine(EngineOptions(), record) == EngineOptions(parameters=(study / "quick.txt",))
+    assert fill_labels(ComparisonLabels(), [load]) == ComparisonLabels(labels=files["labels"], names=files["names"])
+    directions = {"plate_normal_lps": [0.0, 0.0, -1.0], "shear_direction_lps": [0.0, -1.0, 0.0]}
+    assert record.parameters.items() >= directions.items()
 
 
 def test_nothing_half_written_is_left(results, study):
