@@ -124,8 +124,8 @@ def _offered(model: type[Options], field: str, info: FieldInfo) -> inspect.Param
     return inspect.Parameter(
         field,
         inspect.Parameter.KEYWORD_ONLY,
-        default=inspect.Parameter.empty if info.is_required() else default,
-        annotation=Annotated[kind if default is not None or info.is_required() else kind | None, option],
+        default=default,
+        annotation=Annotated[kind if default is not None else kind | None, option],
     )
 
 

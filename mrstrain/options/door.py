@@ -67,8 +67,8 @@ def _flat_signature(function: Callable[..., object], models: _Models) -> inspect
             parameters.append(own.replace(annotation=bare(own.annotation, [])))
             continue
         for field, info in models[name].model_fields.items():
-            default, kind = own.empty if info.is_required() else info.default, bare(info.annotation, [])
-            parameters.append(inspect.Parameter(field, own.KEYWORD_ONLY, default=default, annotation=kind))
+            kind = bare(info.annotation, [])
+            parameters.append(inspect.Parameter(field, own.KEYWORD_ONLY, default=info.default, annotation=kind))
     return signature.replace(parameters=parameters)
 
 
@@ -84,9 +84,7 @@ def _flat_docstring(own: str, models: _Models) -> str:
     entries = []
     for model in models.values():
         for field, info in model.model_fields.items():
-            usual = (
-                "" if info.is_required() else ", optional" if info.default is None else f", default {info.default!r}"
-            )
+            usual = ", optional" if info.default is None else f", default {info.default!r}"
             told = re.sub(r"--[a-z-]+", lambda flag: f"`{flags.get(flag[0], flag[0])}`", info.description or "")
             entries.append(f"{field} : {_kind(bare(info.annotation, []))}{usual}")
             entries += textwrap.wrap(told, 116, initial_indent="    ", subsequent_indent="    ")
