@@ -49,17 +49,17 @@ def run(tree: Path, folder: Path, labels: bool, out: Path) -> dict[str, float]:
     return {"wall_s": round(wall, 2), "processor_s": round(processor, 2), "peak_gib": round(peak / 2**20, 2)}
 
 
-def compared(before: Path, count: int, labels: bool, rounds: int) -> dict[str, object]:
-    """Both trees on one pair, in turn; the first round of each only warms its compiled kernels and caches."""
+def compared(before: Path, count: int, labels: bool, rounds: int, warms: int) -> dict[str, object]:
+    """Both trees on one pair, in turn; rounds before the others only warm their compiled loops."""
     trees = {"before": before, "after": HERE}
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         written(heel_pair(seed=1, load=0.6), count, folder)
-        for number in range(rounds + 1):
+        for number in range(-warms, rounds):
             for name, tree in trees.items():
                 one = run(tree, folder, labels, folder / name)
-                if number:
+                if number >= 0:
                     runs[name].append(one)
         shear = [read_image(folder / name / "Load1" / "max_shear.nii.gz", allow_missing=True).values for name in trees]
     both = np.isfinite(shear[0]) & np.isfinite(shear[1])
@@ -83,7 +83,8 @@ def main() -> None:
     done: list[dict[str, object]] = []
     for count in given.sizes:
         for labels in (False, True):
-            done.append(compared(given.before.resolve(), count, labels, given.rounds))
+            warms = int(count == given.sizes[0])
+            done.append(compared(given.before.resolve(), count, labels, given.rounds, warms))
             print(json.dumps(done[-1]), flush=True)
             given.out.write_text(json.dumps({"versions": versions(), "cores": os.cpu_count(), "runs": done}, indent=1))
 
