@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, TimeoutError as FutureTimeout
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
+from importlib import import_module
 from typing import Any, TypeVar
 
 from loky import ProcessPoolExecutor
@@ -45,20 +46,19 @@ class Worker(AbstractContextManager["Worker", None]):
         self._executor: ProcessPoolExecutor | None = None
         self._lock = threading.Lock()
 
+    def start(self, module: str) -> None:
+        """Start the child process and let it import a module, while the caller does something else."""
+        with self._lock:
+            self._running().submit(_imported, module)
+
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
         """Run ``task(*args)`` in the child; its exceptions are raised here, and `WorkerError` if the child dies.
 
         ``what`` is the task in words ("registering Load1"); ``watch`` is called about twice a second meanwhile.
         """
         with self._lock:
-            if self._executor is None:
-                count = str(self.threads)
-                names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
-                # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process.
-                environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
-                environment |= _MEMORY
-                self._executor = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
-            future = self._executor.submit(task, *args)
+            executor = self._running()
+            future = executor.submit(task, *args)
             while True:
                 try:
                     return future.result(timeout=_POLL_S)  # type: ignore[no-any-return]
@@ -68,7 +68,7 @@ class Worker(AbstractContextManager["Worker", None]):
                     if watch is not None:
                         watch()
                 except (TerminatedWorkerError, ShutdownExecutorError) as died:
-                    self._executor.shutdown(wait=False, kill_workers=True)
+                    executor.shutdown(wait=False, kill_workers=True)
                     self._executor = None
                     code = re.search(r"\{(.*)\}", str(died), re.DOTALL)
                     raise WorkerError(
@@ -77,6 +77,16 @@ class Worker(AbstractContextManager["Worker", None]):
                         "your own elastix parameter files with several metrics, set "
                         '(UseMultiThreadingForMetrics "false").'
                     ) from died
+
+    def _running(self) -> ProcessPoolExecutor:
+        """The child process, started where there is none."""
+        if self._executor is None:
+            count = str(self.threads)
+            names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
+            # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process.
+            environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"} | _MEMORY
+            self._executor = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
+        return self._executor
 
     def kill(self) -> None:
         """End the child process at once, whatever it is doing; a task in it raises `WorkerError`."""
@@ -90,13 +100,20 @@ class Worker(AbstractContextManager["Worker", None]):
                 self._executor.shutdown(wait=True)
                 self._executor = None
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is not None:
+            self.kill()
         self.close()
 
 
-def each_in_workers(items: Iterable[_I], task: Callable[[_I, Worker], None], *, at_once: int, threads: int) -> None:
-    """Run ``task(item, worker)`` for every item, ``at_once`` at a time; an error or interrupt ends every worker."""
-    with _workers(at_once, threads) as each:
+def each_in_workers(
+    items: Iterable[_I], task: Callable[[_I, Worker], None], *, at_once: int, threads: int, first: Worker | None = None
+) -> None:
+    """Run ``task(item, worker)`` for every item, ``at_once`` at a time; an error or interrupt ends every worker.
+
+    The ``first`` of them may have been started before.
+    """
+    with _workers(at_once, threads, first) as each:
         list(each(task, items))
 
 
@@ -111,15 +128,18 @@ def side_by_side(what: str, at_once: int) -> Iterator[Each]:
 
 
 @contextmanager
-def _workers(at_once: int, threads: int) -> Iterator[Callable[[Callable[[Any, Worker], Any], Iterable[Any]], Any]]:
+def _workers(
+    at_once: int, threads: int, first: Worker | None = None
+) -> Iterator[Callable[[Callable[[Any, Worker], Any], Iterable[Any]], Any]]:
     """A `map` of tasks that get an item and a worker, one of so many that are kept to the end of the block."""
     local = threading.local()
-    workers: list[Worker] = []
+    workers = [Worker(threads) for _ in range(at_once)]  # whose processes start when they are needed
+    workers[0] = first or workers[0]
+    idle = iter(workers)
 
     def one(task: Callable[[Any, Worker], Any], item: object) -> object:
         if not hasattr(local, "worker"):
-            local.worker = Worker(threads)
-            workers.append(local.worker)
+            local.worker = next(idle)
         return task(item, local.worker)
 
     pool = ThreadPoolExecutor(at_once)
@@ -133,6 +153,10 @@ def _workers(at_once: int, threads: int) -> Iterator[Callable[[Callable[[Any, Wo
         pool.shutdown(wait=True, cancel_futures=True)
         for worker in workers:
             worker.close()
+
+
+def _imported(module: str) -> None:
+    import_module(module)
 
 
 def _end_with(parent: int) -> None:

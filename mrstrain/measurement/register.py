@@ -72,31 +72,34 @@ def register(
             "and bone_label (--labels, --bone-label).\n"
             "If the images show no bone, use align image (--align image)."
         )
-    subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
-    images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
-    # Read now: what is wrong with it must not be found after an hour.
-    model = None if registration.error_model is None else read_error_model(registration.error_model)
-    points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
-    subject = replace(subject, tissue=subject.body())
-    held = {"bone": subject.bone, "image": subject.tissue, "none": None}[align]  # its rigid motion is found by aligning
-    start = None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
-    refuse_one_image_twice(
-        [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
-    )
-    needed = (_BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel) * int(np.prod(subject.reference.grid.shape)) * len(cases)
-    refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
-    make_output(target)
     at_once, threads = _shares(running, 1 if registration.chain else len(cases))
-    settings = Settings(chosen, align, running.seed, threads)
-    model = model or error_model_of(chosen.name)
-    files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}}
-    more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
-    more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
-    more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}
-    record = record_of(subject, files, settings, registration, more)
-    plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
-    run = _Run(target, plan, images, start, progress or (lambda *_: None))
-    run.all(at_once, registration.chain)
+    with Worker(threads) as first:
+        first.start(Plan.__module__)
+        subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
+        images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
+        # Read now: what is wrong with it must not be found after an hour.
+        model = None if registration.error_model is None else read_error_model(registration.error_model)
+        points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
+        subject = replace(subject, tissue=subject.body())
+        # Its rigid motion is found by aligning.
+        held = {"bone": subject.bone, "image": subject.tissue, "none": None}[align]
+        start = None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
+        scanned = [subject.reference, *images.values()]
+        refuse_one_image_twice([(str(path), image) for path, image in zip((load0, *paths), scanned, strict=True)])
+        voxels = int(np.prod(subject.reference.grid.shape))
+        needed = (_BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel) * voxels * len(cases)
+        refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
+        make_output(target)
+        settings = Settings(chosen, align, running.seed, threads)
+        model = model or error_model_of(chosen.name)
+        files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}}
+        more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
+        more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
+        more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}
+        record = record_of(subject, files, settings, registration, more)
+        plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
+        run = _Run(target, plan, images, start, progress or (lambda *_: None))
+        run.all(at_once, registration.chain, first)
     return Series.of(target, run.finished(), run.failures, record)
 
 
@@ -121,20 +124,21 @@ def register_one(
     A folder ``out`` that is called "repeat" is that of a repeat scan. ``tell(stage, fraction)`` reports progress. Other
     parameters, and errors, are those of `register`.
     """
-    how, missing = registration, series.allow_missing
-    subject = read_subject(load0, subject_files, onto, allow_missing=missing)
-    loaded = read_image(load, allow_missing=missing)
-    chosen = engine_of(how, labelled=True)
-    settings = Settings(chosen, how.align, series.seed, series.threads or 1)
-    model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
-    floor = None if series.repeat is None else read_noise_floor(series.repeat / QUALITY)
-    start = None if series.after is None else spline_in(series.after)
-    more = {"allow_missing": missing, "bone_label": subject_files.bone_label}
-    more["shear_direction_lps"] = onto.plain()["shear_direction"]
-    chained = how.model_copy(update={"chain": series.after is not None})
-    record = record_of(subject, {"loads": [load]}, settings, chained, more)
-    plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, how.twin)
-    with Worker(settings.threads) as worker:
+    how, missing, threads = registration, series.allow_missing, series.threads or 1
+    with Worker(threads) as worker:
+        worker.start(Plan.__module__)
+        subject = read_subject(load0, subject_files, onto, allow_missing=missing)
+        loaded = read_image(load, allow_missing=missing)
+        chosen = engine_of(how, labelled=True)
+        settings = Settings(chosen, how.align, series.seed, threads)
+        model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
+        floor = None if series.repeat is None else read_noise_floor(series.repeat / QUALITY)
+        start = None if series.after is None else spline_in(series.after)
+        more = {"allow_missing": missing, "bone_label": subject_files.bone_label}
+        more["shear_direction_lps"] = onto.plain()["shear_direction"]
+        chained = how.model_copy(update={"chain": series.after is not None})
+        record = record_of(subject, {"loads": [load]}, settings, chained, more)
+        plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, how.twin)
         done = plan.register(out.name, loaded, start, worker, tell)
     return plan.write(out, done, floor)[0]
 
@@ -185,7 +189,7 @@ class _Run:
         if REPEAT not in images:
             self._floor_known.set()
 
-    def all(self, at_once: int, chain: bool) -> None:
+    def all(self, at_once: int, chain: bool, first: Worker) -> None:
         last: list[Deformation] = []
         names = sorted(self.images, key=lambda name: name != REPEAT)  # its floor is waited for
         not_begun = set(names)
@@ -213,7 +217,7 @@ class _Run:
                 if is_repeat:
                     self._floor_known.set()
 
-        each_in_workers(names, one, at_once=at_once, threads=self.plan.settings.threads)
+        each_in_workers(names, one, at_once=at_once, threads=self.plan.settings.threads, first=first)
 
     def finished(self) -> tuple[Case, ...]:
         """The loads that were registered, in the order given; RegistrationError where none was."""

@@ -27,6 +27,10 @@ def _fails() -> None:
     raise RegistrationError("no overlap")
 
 
+def _imports(module: str) -> bool:
+    return module in sys.modules
+
+
 def _process() -> tuple[int, str | None]:
     return os.getpid(), os.environ.get("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS")
 
@@ -68,6 +72,17 @@ def test_one_process_serves_many_tasks_with_the_threads_asked_for():
         second, _ = worker.run("asking", _process)
     assert first == second
     assert threads == "2"
+
+
+def test_a_started_worker_has_imported_what_it_was_told_and_is_the_first_to_be_used():
+    used = []
+    with Worker(threads=1) as first:
+        first.start("wave")
+        tasks = [lambda worker: used.append((worker, worker.run("asking", _imports, "wave")))]
+        each_in_workers(tasks, lambda task, worker: task(worker), at_once=2, threads=1, first=first)
+        assert used == [(first, True)]
+    with Worker(threads=1) as other:
+        assert not other.run("asking", _imports, "wave")
 
 
 def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():

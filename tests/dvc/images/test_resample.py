@@ -9,6 +9,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from dvc.deformation.protocol import Affine, RigidMotion
+from dvc.images import bias_field
 from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, fill_missing, shows, smoothed
@@ -117,6 +118,23 @@ def test_shading_is_removed_whatever_the_images_zero(offset):
             assert sitk.ProcessObject.GetGlobalDefaultNumberOfThreads() == threads
     finally:
         sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
+
+
+def test_the_unloaded_image_of_a_series_is_corrected_once(monkeypatch):
+    counted = []
+    correct = bias_field._corrected
+    monkeypatch.setattr(bias_field, "_first", {})
+    monkeypatch.setattr(bias_field, "_corrected", lambda image: counted.append(image) or correct(image))
+    random = np.random.default_rng(8)
+    grid = Grid((16, 16, 16), np.full(3, 2.0), np.zeros(3))
+    unloaded, *loaded = (Image(grid, 50.0 + random.normal(size=grid.shape)) for _ in range(3))
+    for load in loaded:
+        found = without_bias_field([unloaded, load])
+        np.testing.assert_allclose(found[0].values, correct(unloaded).values, rtol=1e-5)
+    assert len(counted) == 3
+    moved = Image(Grid(grid.shape, np.full(3, 2.5), np.zeros(3)), unloaded.values)
+    assert np.array_equal(without_bias_field([moved, loaded[0]])[0].grid.spacing_mm, moved.grid.spacing_mm)
+    assert len(counted) == 5
 
 
 def test_a_hash_follows_the_voxels_that_a_header_names(tmp_path):
