@@ -83,7 +83,7 @@ lock:
 		--no-header --no-emit-index-url --no-emit-find-links --quiet $(UPGRADE) -o requirements.lock
 
 docs: .venv-docs/installed.stamp
-	NO_MKDOCS_2_WARNING=1 .venv-docs/$(notdir $(BIN))/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 .venv-docs/$(notdir $(BIN))/mkdocs build --strict
 
 .venv-docs/installed.stamp: docs/requirements.txt
 	"$(PYTHON)" -m venv --clear .venv-docs
