@@ -194,7 +194,8 @@ def test_study_files_of_the_pages_can_be_read(tmp_path: Path) -> None:
 
 def anchors(page: Path) -> set[str]:
     """Of the headings of a page, as the site and the repository's host make them."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)
+    whole = re.sub(r'^--8<-- "([^":]+)"$', lambda part: (ROOT / part[1]).read_text(), page.read_text(), flags=re.M)
+    text = re.sub(r"^```.*?^```", "", whole, flags=re.S | re.M)
     headings = re.findall(r"^#+ (.*)$", text, re.M)
     return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower()).strip()) for heading in headings}
 

@@ -1,0 +1,201 @@
+"""The plots of docs/benchmarks/README.md, from the result files alone.
+
+    .venv/bin/python -m benchmarks.plots
+
+Writes docs/images/benchmarks/*.webp. Nothing is measured here: run it again when a file in `results/` has changed.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks.accuracy_tables import CONDITIONS, USUAL, Results
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results"
+IMAGES = HERE.parent / "docs" / "images" / "benchmarks"
+TISSUES = ("fat", "muscle", "skin", "bone")
+OURS, LABELS, ELASTIX, OTHERS = "#0b6e99", "#14a37f", "#d9730d", "#9aa5b1"
+ENGINES = {
+    "gauss-newton": ("default engine", OURS),
+    "gauss-newton-borders": ("with a label map", LABELS),
+    "heel-mr": ("elastix (heel-mr)", ELASTIX),
+}
+PEERS = {
+    "gauss-newton": "mrstrain", "gauss-newton-borders": "mrstrain with a label map", "heel-mr": "mrstrain with elastix",
+    "elastix default, as acquired": "elastix, defaults",
+}  # fmt: skip
+SETS = ("trebbi", "zwam", "erdemir", "luboz")
+
+
+def read(name: str) -> Any:
+    """A result file by its name."""
+    return json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def panels(count: int = 1, height: float = 3.2) -> tuple[Figure, list[Axes]]:
+    """Plots side by side, without frames."""
+    figure, axes = plt.subplots(1, count, figsize=(9, height), layout="constrained", squeeze=False)
+    for one in axes.flat:
+        one.spines[["top", "right"]].set_visible(False)
+        one.grid(axis="y", color="#e5e8ec")
+        one.set_axisbelow(True)
+    return figure, list(axes.flat)
+
+
+def peers() -> Figure:
+    """Error of every program by tissue, means of the pairs set aside."""
+    runs = [run for run in read("peers")["runs"] if run["status"] == "done"]
+    errors = {
+        peer: [mean(run["tissues"][t]["shear_rmse"] for run in runs if run["peer"] == peer) for t in TISSUES]
+        for peer in {run["peer"] for run in runs} - {"elastix default"}
+    }
+    figure, axes = panels(len(TISSUES), 3.6)
+    order = sorted(errors, key=lambda peer: errors[peer][0], reverse=True)
+    for column, (one, tissue) in enumerate(zip(axes, TISSUES, strict=True)):
+        colours = [ENGINES[p][1] if p in ENGINES else OTHERS for p in order]
+        bars = one.barh(range(len(order)), [errors[p][column] for p in order], color=colours)
+        one.bar_label(bars, fmt="%.3f", padding=2, fontsize=7)
+        one.grid(visible=False)
+        one.set(title=tissue, xticks=[], xlim=(0, 1.25 * max(errors[p][column] for p in order)))
+        one.set_yticks(range(len(order)), [PEERS.get(p, p) for p in order] if not column else [], fontsize=8)
+    figure.supxlabel("root mean square error of the maximum shear strain", fontsize=9)
+    return figure
+
+
+def error() -> Figure:
+    """Error in fat and skin over noise and voxel size."""
+    figure, axes = panels(3)
+    names = [f"{voxel} mm\nSNR {snr:g}" for voxel, snr in CONDITIONS]
+    names[3] = "0.8, 0.8,\n1.6 mm"
+    names[4] = "1.2 mm"
+    for one, tissue in zip(axes, ("fat", "muscle", "skin"), strict=True):
+        for engine, (label, colour) in ENGINES.items():
+            results = Results(RESULTS / "accuracy" / engine)
+            values = [results.error(tissue, condition=condition) for condition in CONDITIONS]
+            one.plot(range(3), values[:3], "o-", color=colour, label=label)
+            one.plot((3, 4), values[3:], "o", color=colour)
+        one.set(title=tissue, ylim=(0, 0.08))
+        one.set_xticks(range(len(names)), names, fontsize=7)
+    axes[0].set_ylabel("RMSE of the max. shear")
+    axes[0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def resolution() -> Figure:
+    """How much of a sinusoidal shear is recovered over its wavelength."""
+    figure, axes = panels(3)
+    for one, tissue in zip(axes, ("fat", "muscle", "skin"), strict=True):
+        for engine in ("gauss-newton", "heel-mr"):
+            label, colour = ENGINES[engine]
+            rows = sorted(
+                (float(row["wavelength_mm"]), float(row["recovered"]))
+                for row in Results(RESULTS / "accuracy" / engine).table("resolution.csv")
+                if (row["voxel_mm"], float(row["snr"])) == USUAL and row["tissue"] == tissue
+            )
+            one.plot(*zip(*rows, strict=True), "o-", color=colour, label=label)
+        one.axhline(0.9, color="k", linewidth=0.6, linestyle=":")
+        one.set(title=tissue, xlabel="wavelength, mm", ylim=(0, 1.1))
+    axes[0].set_ylabel("share recovered")
+    axes[2].legend(frameon=False, fontsize=8, loc="lower right")
+    return figure
+
+
+def areas() -> Figure:
+    """Area between strain-volume curves of a heel with a hidden model: true, and as a study estimates it."""
+    told = read("hidden_law")
+    figure, axes = panels(5, 3)
+    for one, load in zip(axes, ("Load1", "Load2", "Load3", "Load4", "all loads"), strict=True):
+        for place, name in enumerate(SETS):
+            _, estimate, low, high = told["measured_area_ml"][load][name]
+            one.plot((place, place), (low, high), color=OURS, linewidth=5, alpha=0.35, label=None if place else "95 %")
+            one.plot(place, estimate, "_", color=OURS, markersize=12, label=None if place else "estimated")
+            one.plot(place, told["true_area_ml"][load][name], "kx", label=None if place else "true")
+        one.set_title(load)
+        one.set_ylim(bottom=0)
+        one.set_xticks(range(len(SETS)), SETS, rotation=45, fontsize=8)
+    axes[0].set_ylabel("area, mL")
+    axes[0].legend(frameon=False, fontsize=7)
+    return figure
+
+
+def registration() -> Figure:
+    """Processor time and memory of `mrstrain register` over the number of voxels."""
+    figure, axes = panels(2)
+    kinds = {(False, None): ENGINES["gauss-newton"], (True, None): ENGINES["gauss-newton-borders"],
+             (False, "heel-mr"): ENGINES["heel-mr"]}  # fmt: skip
+    runs = read("register_scaling")["runs"]
+    for one, key, label in zip(axes, ("processor_s", "peak_gib"), ("processor time, s", "memory, GiB"), strict=True):
+        for (labels, preset), (name, colour) in kinds.items():
+            chosen = sorted(
+                (run["voxels"] / 1e6, run[key]) for run in runs if (run["labels"], run["preset"]) == (labels, preset)
+            )
+            one.plot(*zip(*chosen, strict=True), "o-", color=colour, label=name)
+        one.set(xlabel="million voxels", ylabel=label, xlim=(0, None), ylim=(0, None))
+    axes[0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def elements() -> Figure:
+    """The solver: a lift of the sole beside CalculiX, and time and memory over the number of cells."""
+    figure, axes = panels(3)
+    runs = read("fe_speed")["runs"]
+    programs = {"P1": "mrstrain", "C3D4": "CalculiX\nC3D4", "C3D10": "CalculiX\nC3D10"}
+    for place, program in enumerate(programs):
+        seconds = [run["seconds"] for run in runs if run["program"] == program and run["seconds"]]
+        given_up = [run["given_up_after_s"] for run in runs if run["program"] == program and not run["seconds"]]
+        height = median(seconds) if seconds else given_up[0]
+        bar = axes[0].bar(place, height, color=OURS if program == "P1" else OTHERS, hatch="" if seconds else "//")
+        force = [run["force_n"] for run in runs if run["program"] == program and run["seconds"]]
+        told = f"{height:.1f} s\n{force[0]:.1f} N" if seconds else f"given up\nafter {height:.0f} s"
+        axes[0].bar_label(bar, [told], fontsize=8)
+    axes[0].set(ylabel="one lift, s", ylim=(0, 120))
+    axes[0].set_xticks(range(3), programs.values(), fontsize=8)
+    for file, name in (("fe_scaling", "one set of meshes"), ("fe_scaling_320k", "another")):
+        scaling = read(file)
+        colour = OURS if file == "fe_scaling" else LABELS
+        for one, key, label in zip(axes[1:], ("load_s", "peak_gib"), ("Load1, s", "memory, GiB"), strict=True):
+            one.plot(np.array(scaling["cells"]) / 1000.0, scaling["least"][key], "o-", color=colour, label=name)
+            one.set(xlabel="thousand cells", ylabel=label, xlim=(0, None), ylim=(0, None))
+    axes[1].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def convergence() -> Figure:
+    """Fat's strain and the plate's displacement over the size of the cells, relative to their limits."""
+    told = read("converge_heel")
+    figure, (one,) = panels(1, 2.8)
+    names = (
+        "plate displacement",
+        *(f"max. shear of fat, {p}" for p in ("median", "90th percentile", "99th percentile")),
+    )
+    for row, name in zip(told["rows"], names, strict=True):
+        one.plot(told["sizes_mm"], 100.0 * (np.array(row["values"]) / row["limit"]["limit"] - 1.0), "o-", label=name)
+    one.axhline(0.0, color="k", linewidth=0.6)
+    one.set(xlabel="size of the cells, mm", ylabel="off the limit, %", xlim=(0, None))
+    one.legend(frameon=False, fontsize=8)
+    return figure
+
+
+PLOTS = (peers, error, resolution, areas, registration, elements, convergence)
+
+
+def main() -> None:
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    for plot in PLOTS:
+        plot().savefig(IMAGES / f"{plot.__name__}.webp", dpi=110, pil_kwargs={"quality": 85, "method": 6})
+
+
+if __name__ == "__main__":
+    main()
