@@ -167,7 +167,7 @@ def test_a_simulation_may_have_a_limit_of_time(tmp_path):
 
 
 def test_the_page_on_studies_names_every_key_and_no_other():
-    page = (Path(__file__).parents[3] / "docs" / "study.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "study-file.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `\[(\w+)(?:\.NAME)?\]` \|(.*)\|$", page, re.MULTILINE)
     assert {table for table, _ in rows} == set(_fields_at([]))
     for table, keys in rows:

@@ -1,0 +1,125 @@
+"""The pictures at the head of the pages, from results of the demonstration and of the tutorials' own tests.
+
+    mrstrain demo --out DEMO
+    python -m pytest tests/test_tutorials.py -o tmp_path_retention_policy=all --basetemp=TUTORIALS
+    python docs/pictures.py DEMO TUTORIALS
+
+Pictures of the gallery are made by its examples (docs/gallery.md), those of the benchmarks by benchmarks/plots.py.
+"""
+
+import base64
+import io
+import re
+import sys
+from datetime import datetime
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from PIL import Image
+
+import dvc
+import fe
+import phantoms
+
+IMAGES = Path(__file__).resolve().parent / "images"
+WIDTH = 900  # pixels
+
+DEMO = {
+    "measure": "registration/Load1/figures/strain.png",
+    "simulate": "models/trebbi/slices.png",
+    "mesh": "mesh/mesh.png",
+    "study": "comparison/slices_by_load.png",
+    "validate": "comparison/curves_by_load.png",
+}
+TUTORIALS = {
+    "tutorial-register": "test_register0/results/Load1/figures/strain.png",
+    "tutorial-validate": "test_validate0/compared/Load1/slices.png",
+    "tutorial-material": "test_material0/fit/fit.png",
+    "tutorial-cohort": "test_cohort0/cohort/report.html",
+    "other-codes": "test_validate0/compared/Load1/agreement.png",
+    "python-validate": "test_validate_in_python0/compared/curves_by_load.png",
+    "python-dvc": "test_dvc_in_python0/max_shear.png",
+}
+
+
+def save(name: str, picture: Image.Image) -> None:
+    """As WebP of at most `WIDTH` pixels."""
+    picture = picture.convert("RGB")
+    picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
+    picture.save(IMAGES / f"{name}.webp", quality=80, method=6)
+
+
+def opened(source: Path) -> Image.Image:
+    """A picture file, or the first picture of a report."""
+    if source.suffix == ".html":
+        first = re.search(r"data:image/[a-z]+;base64,([^\"')]+)", source.read_text())
+        assert first, source
+        return Image.open(io.BytesIO(base64.b64decode(first[1])))
+    return Image.open(source)
+
+
+def drawn(figure: plt.Figure) -> Image.Image:
+    """A figure of matplotlib as a picture."""
+    file = io.BytesIO()
+    figure.savefig(file, dpi=110)
+    return Image.open(file)
+
+
+def timeline(log: Path) -> plt.Figure:
+    """The stages of a study over time."""
+    ended = re.findall(r"^(\S+)Z (\w[^:]*): done after (\d+) s$", log.read_text(), re.M)
+    ends = [datetime.fromisoformat(time).timestamp() for time, _, _ in ended]
+    took = [float(seconds) for _, _, seconds in ended]
+    starts = [end - seconds for end, seconds in zip(ends, took, strict=True)]
+    figure, axes = plt.subplots(figsize=(9, 3), layout="constrained")
+    colours = {"mesh": "tab:gray", "register": "tab:blue", "simulate": "tab:orange", "compare": "tab:green"}
+    order = sorted(range(len(ended)), key=starts.__getitem__, reverse=True)
+    for row, n in enumerate(order):
+        axes.barh(row, took[n], left=starts[n] - min(starts), color=colours[ended[n][1].split()[0]])
+    axes.set_yticks(range(len(order)), [ended[n][1] for n in order])
+    axes.set(xlabel="time", xticks=[])
+    return figure
+
+
+def phantom_scans() -> plt.Figure:
+    """A sagittal slice of the phantom heel, unloaded and under Load1, and its true strain."""
+    heel, grid = phantoms.Heel(seed=1), phantoms.heel_grid(spacing_mm=0.8)
+    motion = phantoms.under_load(heel, "Load1")
+    middle = grid.part((slice(grid.shape[0] // 2, grid.shape[0] // 2 + 2), slice(None), slice(None)))
+    tissue = phantoms.labels_of(heel, middle).labels > 0
+    true = dvc.strain_maps(motion, dvc.Mask(middle, tissue)).max_shear
+    scans = [phantoms.scan(heel, grid, moved, snr=25.0, number=n).values for n, moved in enumerate((None, motion))]
+    figure, axes = plt.subplots(1, 3, figsize=(9, 3.4), layout="constrained")
+    slices = [*(scan[grid.shape[0] // 2] for scan in scans), true[0]]
+    for one, image, title in zip(axes, slices, ("unloaded", "Load1", "true max. shear"), strict=True):
+        one.imshow(image.T, origin="lower", cmap="viridis" if title.startswith("true") else "gray")
+        one.set_title(title)
+        one.axis("off")
+    return figure
+
+
+def bed() -> plt.Figure:
+    """Tissue on a flat bone on a plate behind it, pressed and pulled upward, as over a sacrum."""
+    values = dvc.Grid((16, 9, 16), (2.5, 2.5, 2.5), (0.0, 0.0, 0.0))
+    labels = 0 * values.points()[..., 0].astype(int) + 1  # fat
+    labels[:, -1], labels[:, :2] = 2, 3  # skin behind, bone in front
+    mesh, _ = fe.mesh_labels(dvc.LabelMap(values, labels, {1: "fat", 2: "skin", 3: "bone"}), edge_mm=3.5)
+    plate = fe.Plate(normal=(0, 1, 0), shear=(0, 0, 1))
+    loads = [fe.LoadStep("supine", normal_n=12.0), fe.LoadStep("sliding down", normal_n=12.0, shear_n=5.0)]
+    return fe.simulate(mesh, "trebbi", plate, loads).plot()
+
+
+def main() -> None:
+    """All of them."""
+    demo, tutorials = map(Path, sys.argv[1:])
+    for name, path in DEMO.items():
+        save(name, opened(demo / "results" / path))
+    for name, path in TUTORIALS.items():
+        save(name, opened(tutorials / path))
+    save("cluster", drawn(timeline(demo / "results" / "study.log")))
+    save("phantoms", drawn(phantom_scans()))
+    save("other-sites", drawn(bed()))
+
+
+if __name__ == "__main__":
+    main()
