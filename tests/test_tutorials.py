@@ -13,8 +13,10 @@ import typer
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
+from dvc import Grid, Image, StrainField
 from dvc.io.images.labels import read_labels
-from dvc.io.images.write import write_mask
+from dvc.io.images.write import write_image, write_mask
+from fe import read_material_sets
 from mrstrain.cli.app import app
 from mrstrain.studies.file import read_study
 from mrstrain.truth.phantom import phantom
@@ -115,6 +117,34 @@ def test_phantoms_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_validate_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("python/validate.md", tmp_path, monkeypatch)  # which makes all its files itself
+
+
+def write_spam(folder: Path, gradient: np.ndarray) -> None:
+    """An oblique image, and a linear displacement of its voxels as spam-ldic writes it: in voxels, Z first."""
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    grid = Grid((24, 21, 18), (1.0, 1.2, 1.5), (5.0, -7.0, 9.0), turned)
+    inside = np.zeros(grid.shape, dtype=np.float32)
+    inside[3:-3, 3:-3, 3:-3] = 100.0
+    write_image(folder / "Load0.nii.gz", Image(grid, inside))
+    zyx = np.stack(np.meshgrid(*(np.arange(2.0, n - 1.0, 3.0) for n in (18, 21, 24)), indexing="ij"), -1).reshape(-1, 3)
+    u_mm = grid.points_at(zyx[:, ::-1]) @ gradient.T
+    voxels = (u_mm @ turned / grid.spacing_mm)[:, ::-1]
+    head = ["NodeNumber", "Zpos", "Ypos", "Xpos", "Zdisp", "Ydisp", "Xdisp", "returnStatus"]
+    rows = np.column_stack([np.arange(len(zyx)), zyx, voxels, np.full(len(zyx), 2.0)])
+    np.savetxt(folder / "Load0-Load1-ldic.tsv", rows, delimiter="\t", header="\t".join(head), comments="")
+
+
+def test_coming_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gradient = np.array([[0.05, 0.2, 0.0], [0.0, -0.04, 0.1], [0.0, 0.03, 0.02]])
+    write_spam(tmp_path, gradient)
+    names = follow("coming-from.md", tmp_path, monkeypatch)
+    found = names["measured"].max_shear  # type: ignore[attr-defined]
+    true = StrainField.from_gradient(gradient[None]).max_shear[0]
+    np.testing.assert_allclose(found[np.isfinite(found)], true, rtol=0.01)
+    (block,) = re.findall(r"^```toml\n(.*?)^```", (DOCS / "coming-from.md").read_text(), re.S | re.M)
+    (tmp_path / "mine.toml").write_text(block)
+    fat = read_material_sets(tmp_path / "mine.toml")["mine"].materials["fat"]
+    assert fat.shear_modulus_mpa == pytest.approx(0.0017)
 
 
 @pytest.mark.full_size

@@ -1,0 +1,46 @@
+"""Every example of the gallery runs as it stands, asserts a number and draws its picture; the page shows them all."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+from matplotlib import pyplot as plt
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+EXAMPLES = sorted((DOCS / "gallery").glob("*.py"))
+SLOW = {"error_bars"}  # error bars need voxels of full size
+MOST_BYTES = 40_000
+
+
+@pytest.mark.parametrize(
+    "example",
+    [pytest.param(one, id=one.stem, marks=[pytest.mark.full_size] * (one.stem in SLOW)) for one in EXAMPLES],
+)
+def test_an_example_draws_its_picture(example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("agg")
+    try:
+        runpy.run_path(str(example))
+    finally:
+        plt.close("all")
+    picture = tmp_path / f"{example.stem}.webp"
+    assert picture.read_bytes()[8:12] == b"WEBP"
+    assert picture.stat().st_size < MOST_BYTES
+
+
+def test_the_page_shows_every_example_with_its_picture() -> None:
+    assert len(EXAMPLES) == 12
+    page = (DOCS / "gallery.md").read_text()
+    for example in EXAMPLES:
+        assert "\nassert " in example.read_text(), example
+        assert f"\n--8<--\ndocs/gallery/{example.name}\n--8<--\n" in page, example
+        assert f"(images/gallery/{example.stem}.webp)" in page, example
+        assert (DOCS / "images" / "gallery" / f"{example.stem}.webp").stat().st_size < MOST_BYTES
+
+
+def test_pictures_of_the_site_are_small() -> None:
+    sizes = {picture.name: picture.stat().st_size for picture in (DOCS / "images").rglob("*.*")}
+    assert sum(sizes.values()) < 1_500_000
+    assert max(sizes.values()) < 115_000, sizes
