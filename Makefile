@@ -7,7 +7,8 @@
 #   make lint    ruff, mypy and the import contract
 #   make format  rewrite the sources as ruff formats them
 #   make lock    renew requirements.lock after a change of the dependencies (needs uv; UPGRADE=--upgrade for newer versions)
-#   make docs    the documentation site in ./site (its tools in .venv-docs), refused where a link or a name leads nowhere
+#   make docs    the documentation site in ./site (its tools in .venv-docs), refused where a link or a name leads nowhere,
+#                or where proselint finds a cliche, a redundancy or a filler word
 #   make peers   the environment of benchmarks/peers in .venv-peers (2.9 GB; Python 3.11 is what it was tried with)
 #   make clean   remove the environment and the caches
 #
@@ -36,7 +37,7 @@ PYTEST := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_T
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,14p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,15p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -82,7 +83,12 @@ lock:
 	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-emit-index-url --no-emit-find-links --quiet $(UPGRADE) -o requirements.lock
 
+# What proselint reads: not decisions and the record of the benchmarks, which are of their time. Its checks of typography,
+# of words said twice and of spelling variants take code and formulas for prose, and are off.
+PROSE := README.md CHANGELOG.md $(wildcard docs/*.md) docs/tutorials docs/python docs/reference docs/benchmarks
+
 docs: .venv-docs/installed.stamp
+	.venv-docs/$(notdir $(BIN))/proselint check --config docs/proselint.json $(PROSE)
 	NO_MKDOCS_2_WARNING=1 .venv-docs/$(notdir $(BIN))/mkdocs build --strict
 
 .venv-docs/installed.stamp: docs/requirements.txt
