@@ -1,8 +1,8 @@
 """Finite-element models of soft tissue under load.
 
-From a label map to a conforming tetrahedral mesh, constitutive models with published parameter sets, the fitting of a
-model to a stretch-stress curve, a solver for nearly incompressible tissue under a rigid plate, and decks for other
-solvers. Imports from `dvc` only.
+Conforming tetrahedral meshes from a label map, constitutive models with published parameter sets, fits of a model to a
+stretch-stress curve, a solver for nearly incompressible tissue under a rigid plate, and input files for other solvers.
+Imports from `dvc` only.
 
     import fe
 
@@ -11,8 +11,8 @@ solvers. Imports from `dvc` only.
     simulation = fe.simulate(mesh, fe.material_set("trebbi"), plate, [fe.LoadStep("Load1", normal_n=140.0)])
     print(simulation)
 
-Geometry is LPS mm in the undeformed configuration, force N, stress MPa. A name loads its file when it is first asked
-for, so that importing this is quick.
+Geometry is LPS mm in the undeformed configuration, force N, stress MPa. Each name is loaded when it is first used, so
+that `import fe` is quick.
 """
 
 import lazy_loader

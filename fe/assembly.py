@@ -1,8 +1,8 @@
 """Residual and tangent of a mixed finite-element model, assembled into one symmetric sparse matrix (numba kernels).
 
-Unknowns are the displacements of the nodes (three each, mm), then the pressures (MPa). An unknown has its own equation,
-none where it is fixed, or shares one with others, as nodes taped to a rigid plate do. The sparsity pattern is computed
-once, for all nodes that may ever be taped.
+Unknowns are the displacements of the nodes (three each, mm), then the pressures (MPa). A free unknown has its own
+equation, a fixed one has none, and nodes taped to a rigid plate share equations. The sparsity pattern is computed once,
+for all nodes that may be taped.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,12 +18,12 @@ from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values
 
 _CHUNK = 4096  # cells whose matrices are in memory at once
-_FEW = 0.1  # share of the unknowns up to which it is quicker to evaluate the cells around them twice than all once
+_FEW = 0.1  # fraction of the unknowns up to which it is faster to evaluate the cells around them twice than all once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evaluated:
-    """What was found at a state, by unknown; the tangent's values, where they were formed, are for these equations."""
+    """Forces at a state, by unknown, and the tangent's values for these equations if they were computed."""
 
     state: FloatArray
     forces: FloatArray
@@ -35,13 +35,13 @@ class _Evaluated:
 class Assembler:
     """The sparse system of a model under changing constraints; unknowns in ``fixed`` (f,) never change.
 
-    ``shared`` maps each shared equation, numbered from 0, to the unknowns that may ever follow it.
+    ``shared`` maps each shared equation, numbered from 0, to all unknowns that may follow it.
     """
 
     def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:
         self.model = model
         self._cells = model.unknowns_of_cells()
-        self._nodes = model.space.cells.copy()  # writable, as what is picked from it: kernels are compiled once
+        self._nodes = model.space.cells.copy()  # writable like its slices, so that kernels are compiled only once
         free = np.ones(model.unknowns, dtype=bool)
         free[fixed] = False
         self._own = np.where(free, np.cumsum(free) - 1, -1)  # -1 where fixed
@@ -56,7 +56,7 @@ class Assembler:
         self.forget()
 
     def share(self, followers: Mapping[int, IntArray]) -> None:
-        """Let unknowns follow shared equations, numbered as at the start; all others keep their own."""
+        """Let unknowns follow shared equations (numbered as in the constructor); all others keep their own."""
         equation = self._own.copy()
         for number, unknowns in followers.items():
             equation[unknowns] = self.own_equations + number
@@ -66,7 +66,7 @@ class Assembler:
             self._places[cells] = self._located(cells, equation)
 
     def forget(self) -> None:
-        """Evaluate the next state as a whole, so that no digit of it depends on those before."""
+        """Evaluate the next state completely, so that it does not depend on earlier states, not even by rounding."""
         self._last = _Evaluated(np.empty(0), np.empty(0), np.empty(0), None, self.equation)
 
     def _around(self, unknowns: BoolArray) -> IntArray:
@@ -74,7 +74,7 @@ class Assembler:
         return np.flatnonzero(unknowns[self._cells].any(axis=1))
 
     def _located(self, cells: IntArray, equation: IntArray) -> IntArray:
-        """Places (cells, pairs) in the upper triangle where cells add their tangents, see `_locate`."""
+        """Positions (cells, pairs) in the upper triangle to which cells add their tangents; see `_locate`."""
         width = self._cells.shape[1]
         places = np.empty((len(cells), width * (width + 1) // 2), dtype=np.int32)
         in_parts(_locate, len(cells), self._cells[cells], equation, self.indptr, self.indices, places)
@@ -96,9 +96,9 @@ class Assembler:
         return np.flatnonzero(~used)
 
     def residual(self, state: FloatArray, *, ahead: bool = False) -> tuple[FloatArray, FloatArray, float]:
-        """Forces (N; for pressures mm3) by unknown and by equation, and the least det F; NaN where det F <= 0.
+        """Forces (N; for pressures mm3) by unknown and by equation, and the smallest det F; NaN where det F <= 0.
 
-        ``ahead`` forms the tangent in the same sweep, which is quicker where it is asked for next.
+        ``ahead`` computes the tangent in the same sweep, which is faster if it is needed next.
         """
         if not np.array_equal(state, self._last.state):
             self._last = (self._corrected(state) if ahead else None) or self._evaluated(state, ahead=ahead)
@@ -112,11 +112,11 @@ class Assembler:
             last = self._evaluated(state, ahead=True)
         assert last.tangent is not None
         data = last.tangent.copy()
-        data[self.indptr[self.idle]] = 1.0  # the diagonal stands first in its row
+        data[self.indptr[self.idle]] = 1.0  # the diagonal is the first entry of each row
         return data
 
     def held(self, data: FloatArray, right: FloatArray, equations: IntArray, moves: FloatArray) -> FloatArray:
-        """The values with moves of shared equations prescribed: their diagonal is 1, their columns go to ``right``."""
+        """The values with prescribed moves of shared equations: diagonal 1, columns moved to the right-hand side."""
         kept = data.copy()
         for equation, move in zip(equations, moves, strict=True):
             column = self._columns[equation - self.own_equations]
@@ -138,7 +138,7 @@ class Assembler:
         return np.bincount(self.equation[inside], by_unknown[inside], self.size).astype(np.float64)
 
     def acting(self, state: FloatArray, directions: FloatArray) -> FloatArray:
-        """The tangent times directions (unknowns, k), by unknown, as if each had its own equation."""
+        """The tangent times directions (unknowns, k), by unknown, as if each unknown had its own equation."""
         product = np.zeros_like(directions)
         cells = np.flatnonzero((directions != 0.0).any(axis=1)[self._cells].any(axis=1))
         for part, _, local, _ in self._in_chunks(state, cells, with_tangent=True):
@@ -146,7 +146,7 @@ class Assembler:
         return product
 
     def _evaluated(self, state: FloatArray, *, ahead: bool) -> _Evaluated:
-        """Forces of all cells at a state and, ``ahead``, the tangent."""
+        """Forces of all cells at a state and, with ``ahead``, the tangent."""
         tangent = np.zeros(len(self.indices)) if ahead else None
         found = _Evaluated(
             state.copy(), np.zeros(self.model.unknowns), np.empty(len(self._cells)), tangent, self.equation
@@ -155,7 +155,7 @@ class Assembler:
         return found
 
     def _corrected(self, state: FloatArray) -> _Evaluated | None:
-        """The last evaluation, with the cells around a few unknowns that moved, or follow others now, anew; or None."""
+        """The last evaluation, updated in the cells around the few unknowns that changed; None if too many changed."""
         last = self._last
         if last.tangent is None or not last.lowest.min() > 0.0:
             return None
@@ -171,7 +171,7 @@ class Assembler:
     def _add(
         self, found: _Evaluated, state: FloatArray, cells: IntArray | None, places: IntArray, *, sign: float = 1.0
     ) -> None:  # fmt: skip
-        """Add what cells, all by default, contribute at a state; ``places`` are theirs, in their order."""
+        """Add the contributions of cells (None: all) at a state to ``places``, given in the order of the cells."""
         done = 0
         for part, forces, tangents, lowest in self._in_chunks(state, cells, with_tangent=found.tangent is not None):
             _add_forces(self._cells[part], sign, forces, found.forces)
@@ -183,7 +183,7 @@ class Assembler:
     def _in_chunks(
         self, state: FloatArray, cells: IntArray | None, *, with_tangent: bool
     ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray, FloatArray]]:
-        """Forces, tangents (upper triangles) and least det F of cells, all by default, `_CHUNK` at a time."""
+        """Forces, tangents (upper triangles) and smallest det F of cells (None: all), `_CHUNK` at a time."""
         m, space, element = self.model, self.model.space, self.model.element
         count = 3 * len(space.nodes_mm)
         u = np.ascontiguousarray(state[:count].reshape(-1, 3))
@@ -205,7 +205,7 @@ class Assembler:
             yield part, forces, tangents, volumes[: stop - start]
 
     def _pattern(self, shared: Mapping[int, IntArray]) -> tuple[IntArray, IntArray]:
-        """Upper triangle: equations of unknowns that share a cell, and shared ones with all that may follow them."""
+        """Upper triangle: equations of unknowns that share a cell, and shared equations with all possible followers."""
         count, width = self._cells.shape
         cell = np.repeat(np.arange(count), width)
         meets = sparse.csr_matrix((np.ones(cell.size, dtype=np.int32), (cell, self._cells.ravel())))
@@ -223,7 +223,7 @@ class Assembler:
 def _locate(
     start: int, stop: int, cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, places: IntArray
 ) -> None:  # fmt: skip
-    """Place in the upper triangle of each pair of a cell's unknowns; -1: one is fixed; -2 - place: it counts twice."""
+    """Position in the upper triangle of each pair of a cell's unknowns; -1: one is fixed; -2 - position: add twice."""
     width = cells.shape[1]
     for cell in range(start, stop):
         pair = 0
@@ -241,7 +241,7 @@ def _locate(
                             low = middle + 1
                         else:
                             high = middle
-                    # Two unknowns of one equation: both halves of the symmetric pair fall on its diagonal.
+                    # Two unknowns of one equation: both entries of the symmetric pair are on its diagonal.
                     place = low if row < column or i == j else -2 - low
                 places[cell, pair] = place
                 pair += 1
@@ -283,7 +283,7 @@ def _add_products(cells: IntArray, local: FloatArray, directions: FloatArray, pr
 def _add_stiffness(
     K: FloatArray, weight: float, h: FloatArray, U: FloatArray, direct: FloatArray, swapped: FloatArray
 ) -> None:  # fmt: skip
-    """Add the stiffness between the nodes of a cell at one quadrature point, by gradients in the principal frame."""
+    """Add the stiffness of a cell at one quadrature point, from gradients in the principal frame."""
     D, T, M = direct, swapped[:, :, 1], swapped[:, :, 0]
     for a in range(len(h)):
         x, y, z = weight * h[a, 0], weight * h[a, 1], weight * h[a, 2]
@@ -331,7 +331,7 @@ def _elements(
     weights: FloatArray, tables: FloatArray, pressure: FloatArray, tau: float, u: FloatArray, p: FloatArray,
     with_tangent: bool, forces: FloatArray, tangents: FloatArray, lowest: FloatArray,
 ) -> None:  # fmt: skip
-    """Forces and tangents of cells, and the least det F at the quadrature points of each."""
+    """Forces and tangents of cells, and the smallest det F at the quadrature points of each."""
     nodes, points = tables.shape[1], tables.shape[0]
     width = 3 * nodes + 4
     g, h = np.empty((nodes, 3)), np.empty((nodes, 3))
@@ -383,7 +383,7 @@ def _elements(
                         value += U[i, k] * h[a, k] / s[k]
                     for c in range(4):
                         K[3 * a + i, 3 * nodes + c] += weight * J * value * pressure[q, c]
-        # Pressure with itself: its mass matrix over the bulk modulus, and the stabilisation.
+        # Pressure-pressure block: mass matrix over the bulk modulus, and the stabilisation.
         for c in range(4):
             for d in range(4):
                 mass = volumes[n] / 20.0 * (2.0 if c == d else 1.0)

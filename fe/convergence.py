@@ -1,4 +1,4 @@
-"""What a figure would be on an endlessly fine mesh, from meshes of several sizes."""
+"""Mesh convergence: a quantity extrapolated to an infinitely fine mesh, from meshes of several element sizes."""
 
 from dataclasses import dataclass
 
@@ -15,18 +15,19 @@ _APART = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A figure's value on an endlessly fine mesh, f(h) = limit + slope h^order.
+    """Extrapolation of a quantity to an infinitely fine mesh, f(h) = limit + slope h^order.
 
     Attributes
     ----------
     limit, order : float
-        The order is searched from 0.5 to 2. Figures that seem to converge faster than linear cells can are taken to do
-        so with 2, which puts the limit further away (Eca, Hoekstra 2014, doi:10.1016/j.jcp.2014.01.006). Both are NaN
-        where they show a lower order, do not rise or fall steadily, or have passed the limit already.
+        The order is searched from 0.5 to 2. If the values seem to converge faster than linear cells can, the order is
+        set to 2, which is conservative: the limit lies further away (Eca, Hoekstra 2014,
+        doi:10.1016/j.jcp.2014.01.006). Both are NaN if the observed order is below 0.5, if the values are not
+        monotonic, or if they have already passed the limit.
     scatter : float
-        Root mean square distance of the figures from the curve; 0 with three sizes, which it goes through if it can.
+        Root mean square distance of the values from the curve; with three sizes 0, if a curve fits them exactly.
     error : float
-        Of the figure on the finest mesh, as a share of the limit.
+        Of the value on the finest mesh, as a fraction of the limit.
     """
 
     limit: float
@@ -36,17 +37,17 @@ class Limit:
 
 
 def cell_size_mm(mesh: TetMesh) -> float:
-    """Size of a mesh's cells: the cube root of their mean volume, mm."""
+    """Cell size of a mesh: the cube root of the mean cell volume, mm."""
     return float(np.cbrt(mesh.volumes_mm3.mean()))
 
 
 def extrapolate(sizes_mm: FloatArray, values: FloatArray) -> Limit:
-    """Extrapolate a figure (n,) from meshes of sizes (n,), three or more (Richardson, with the order observed).
+    """Extrapolate a quantity (n,) on meshes of three or more cell sizes (n,) (Richardson, with the observed order).
 
     Raises
     ------
     InputError
-        If there are fewer than three sizes, or the coarsest is not 1.5 times the finest or more.
+        If there are fewer than three sizes, or the coarsest is less than 1.5 times the finest.
 
     Examples
     --------
@@ -58,9 +59,9 @@ def extrapolate(sizes_mm: FloatArray, values: FloatArray) -> Limit:
     h, f = np.asarray(sizes_mm, dtype=np.float64), np.asarray(values, dtype=np.float64)
     if len(h) < _FEWEST or len(np.unique(h)) < len(h) or h.shape != f.shape or h.max() < _APART * h.min():
         raise InputError(
-            f"Extrapolation needs {_FEWEST} or more meshes, the coarsest {_APART} times the size of the finest; got "
-            f"cells of {', '.join(f'{s:.2f}' for s in h)} mm. Where borders lie close together they, and not the edge "
-            "length asked for, set the size: ask for shorter edges."
+            f"Extrapolation needs at least {_FEWEST} meshes of different cell size, the coarsest at least {_APART} "
+            f"times the finest; the cell sizes are {', '.join(f'{s:.2f}' for s in h)} mm. In thin tissues the tissue "
+            "interfaces limit the cell size, not the edge length; use shorter edge lengths."
         )
     best = (np.inf, 0.0, 0.0)
     for order in _ORDERS:

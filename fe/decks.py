@@ -1,8 +1,9 @@
-"""A state of load written for another solver: same mesh, materials, supports, and plate nodes.
+"""Input files (decks) of a simulated load for other solvers, with the same mesh, materials, supports and plate nodes.
 
-A hyperelastic state depends on where its supports are, not on the way there. So a deck in which bone is fixed and the
-nodes on the plate are moved to their final positions has our state as its solution, and its reactions are the plate's
-forces: contact need not be solved again. CalculiX reads one (Abaqus knows the same keywords), FEBio 4 the other.
+A hyperelastic state depends on the final positions of its supports, not on the path. In a deck, bone is fixed and the
+nodes on the plate are moved to their final positions. Its solution is therefore the simulated state, and its reactions
+are the plate's forces; contact need not be solved again. CalculiX reads one format (Abaqus has the same keywords),
+FEBio 4 the other.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,7 @@ from fe.materials import Material, Materials, NeoHooke, Ogden, Yeoh
 from fe.mesh_file import BONE
 from fe.solution import LoadState
 
-_UNUSED = 1e30  # D of a volumetric term that is not wanted: its stiffness is 1 / D
+_UNUSED = 1e30  # D of an unused volumetric term: its stiffness is 1 / D
 _PER_LINE = 12
 _FEBIO_CONTROL = """<Control>
   <analysis>STATIC</analysis><time_steps>20</time_steps><step_size>0.05</step_size>
@@ -47,19 +48,19 @@ def write_calculix(
     Parameters
     ----------
     path : path
-        Ending in .inp. CalculiX prints displacements of all nodes and the plate's total force to the .dat file.
+        Ending in .inp. CalculiX prints the displacement of all nodes and the total force on the plate to the .dat file.
     materials : mapping of region to Material
-        Neo-Hooke, Yeoh and Ogden; volume as in `fe.materials`, which is CalculiX' own (D1 = 2 / K).
+        Neo-Hooke, Yeoh and Ogden; the volumetric energy is as in `fe.materials`, the same as CalculiX's (D1 = 2 / K).
     fixed : sequence of str
-        Facets that do not move.
+        Surface sets that do not move.
     quadratic : bool
-        C3D10 instead of C3D4. Linear tetrahedra without a pressure of their own lock in nearly incompressible tissue:
-        C3D4 is for comparing codes only.
+        C3D10 instead of C3D4. Linear tetrahedra without a pressure field lock in nearly incompressible tissue: use C3D4
+        only to compare codes.
 
     Raises
     ------
     InputError
-        For Hencky's law, which CalculiX does not have.
+        For the Hencky model, which CalculiX does not have.
     """
     write_whole(Path(path), "\n".join(_deck(mesh, materials, state, fixed, quadratic)) + "\n")
 
@@ -96,7 +97,7 @@ def _deck(
 def _supports(
     mesh: TetMesh, space: Space, state: LoadState, fixed: Sequence[str]
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Nodes that are fixed, nodes on the plate, and how far those move; middles of edges go with their ends."""
+    """Fixed nodes, nodes on the plate, and the displacement of the latter; midpoint nodes follow their edges."""
     held = space.nodes_on(np.concatenate([mesh.facets[name] for name in fixed]))
     on_plate = np.sort(state.on_plate)
     moved = state.u_mm[on_plate]
@@ -112,7 +113,7 @@ def _calculix_law(region: str, law: Material) -> tuple[str, str]:
     polynomial, terms = law.vector[:OGDEN].tolist(), law.vector[OGDEN:].tolist()
     d1, count = 2.0 / law.bulk_modulus_mpa, len(terms) // 2
     if count > 3:
-        raise InputError(f"{region}: CalculiX takes Ogden models of up to three terms; this has {count}.")
+        raise InputError(f"{region}: CalculiX takes Ogden models of at most three terms; this one has {count}.")
     forms = {
         NeoHooke: ("NEO HOOKE", [polynomial[0], d1]),
         Yeoh: ("YEOH", [*polynomial[:3], d1, _UNUSED, _UNUSED]),
@@ -120,8 +121,8 @@ def _calculix_law(region: str, law: Material) -> tuple[str, str]:
     }
     if type(law) not in forms:
         raise InputError(
-            f"{region}: CalculiX has no material law that is linear in logarithmic strain (its *ELASTIC is Saint "
-            "Venant-Kirchhoff's, which collapses in compression); choose another set for a deck."
+            f"{region}: CalculiX has no constitutive model that is linear in logarithmic strain. (Its *ELASTIC is the "
+            "Saint Venant-Kirchhoff model, which collapses in compression.) Choose another material set for the deck."
         )
     kind, numbers = forms[type(law)]
     return f"*HYPERELASTIC, {kind}", ", ".join(f"{number:.12g}" for number in numbers)
@@ -133,13 +134,13 @@ def write_febio(
 ) -> None:  # fmt: skip
     """Write an FEBio 4 deck (.feb) of a state, mm, N and MPa, LPS; parameters as `write_calculix`.
 
-    The volume's energy is FEBio's pressure model "Abaqus", K / 2 (J - 1)^2, which is that of `fe.materials`. Written by
-    the format's description and the names in FEBio's sources; FEBio itself has not read it.
+    The volumetric energy is FEBio's pressure model "Abaqus", K / 2 (J - 1)^2, the same as in `fe.materials`. The file
+    follows the description of the format and the names in FEBio's source code; it has not been tested with FEBio.
 
     Raises
     ------
     InputError
-        For Hencky's law.
+        For the Hencky model.
     """
     space = _space(mesh, quadratic)
     held, on_plate, moved = _supports(mesh, space, state, fixed)
@@ -201,17 +202,17 @@ def _febio_law(region: str, law: Material) -> tuple[str, dict[str, float]]:
         Ogden: ("Ogden", numbers | {f"m{n}": alpha for n, (_, alpha) in enumerate(pairs, start=1)}),
     }
     if type(law) not in forms:
-        raise InputError(f"{region}: no FEBio deck is written for {law.law}; choose another set.")
+        raise InputError(f"{region}: FEBio decks do not support the model '{law.law}'. Choose another material set.")
     return forms[type(law)]
 
 
 def _about(state: LoadState) -> tuple[str, ...]:
     force = ", ".join(f"{f:.4g}" for f in state.force_n)
     return (
-        f"Written by mrstrain: the state under {state.load.name}, {state.reached:.0%} of it reached. mm, N, MPa; LPS.",
-        "Bone is fixed; nodes on the plate are moved to where they ended; no contact and no force is in this deck.",
-        f"Force on the plate to expect, along the normal force, the shear and their cross product: {force} N,",
-        "apart from the difference between this element and the one of the simulation.",
+        f"Written by mrstrain: state at {state.reached:.0%} of {state.load.name}. Units mm, N, MPa; frame LPS.",
+        "Bone is fixed; nodes on the plate are moved to their final positions. There is no contact and no force.",
+        f"Expected force on the plate along the normal force, the shear and their cross product: {force} N,",
+        "except for the difference between this element and the one of the simulation.",
     )
 
 
@@ -220,5 +221,5 @@ def _space(mesh: TetMesh, quadratic: bool) -> Space:
 
 
 def _short(prefix: str, region: str, materials: Materials) -> str:
-    """A name of its own that CalculiX takes: letters and digits, under 20 characters."""
+    """A unique name that is valid in CalculiX: letters and digits, under 20 characters."""
     return f"{prefix}{list(materials).index(region) + 1}" + "".join(c for c in region.upper() if c.isalnum())[:15]

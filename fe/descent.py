@@ -1,11 +1,12 @@
-"""Viscous descent to equilibrium, where Newton's method fails: a stiff skin that buckles over soft fat.
+"""Viscous descent to equilibrium for loads at which Newton's method fails, such as stiff skin that buckles over fat.
 
-At such a load the next equilibrium is far, and on the way the tangent has directions along which Newton's step goes
-against the forces. A body without inertia in a viscous medium follows them: c V du/dt = forces out of balance, V the
-nodes' volumes. Its implicit steps, (K + d V) du = forces with d = c / dt, become Newton's as d -> 0 (pseudo-transient
-continuation; Kelley and Keyes 1998, doi:10.1137/S0036142996304796). d rises where a step would go against the forces or
-the tangent predicts the remaining forces badly, and falls where it predicts them well. A few nodes, those of nearly
-flat cells, are predicted badly for long: the medium is thicker there, so that they do not slow down the rest.
+At such a load the next equilibrium is far away, and the tangent is indefinite on the way: Newton's step may point
+against the forces. A body without inertia in a viscous medium follows the forces: c V du/dt = residual forces, V the
+volumes of the nodes. Its implicit steps, (K + d V) du = forces with d = c / dt, become Newton steps as d -> 0
+(pseudo-transient continuation; Kelley and Keyes 1998, doi:10.1137/S0036142996304796). d increases if a step would go
+against the forces or if the tangent predicts the remaining forces badly; it decreases if the prediction is good. At a
+few nodes, those of nearly flat cells, the prediction stays bad. The damping is higher there, so that these nodes do not
+slow down the others.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,26 +22,26 @@ from fe.newton import BALANCED, LEAST_VOLUME, SMALL_MM, Converged, Tolerance, ou
 
 _FIRST, _LEAST, _MOST = 1e-5, 1e-9, 1e6  # damping d, N/mm4
 _MOST_STEPS = 400
-_LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # a longer step is shortened to that; a step that long is damped more
-_MOST_GROWTH = 3.0, 1.5  # of the forces out of balance in one step: far from balance, and near it
-_NEAR = 10.0  # times what is asked
-# Change of d after a step, by the share of those forces that the tangent did not predict: no node counts more than
-# _CLIPPED, those on the plate not at all.
+_LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # longer steps are shortened to the first; beyond the second, damping increases
+_MOST_GROWTH = 3.0, 1.5  # of the residual in one step: far from equilibrium, and near it
+_NEAR = 10.0  # times the tolerance
+# Factor on d after a step, by the fraction of the residual that the tangent did not predict. A node counts at most
+# _CLIPPED, nodes on the plate do not count.
 _CHANGES = ((0.1, 0.2), (0.5, 1.0 / 3.0), (1.0, 0.5), (np.inf, 1.0))
 _CLIPPED = 0.1
-_RISE = 4.0  # of d for a step that goes uphill, too far, or folds a cell
-# After a step that leaves far larger forces: of d, and of the medium's thickness at the nodes that caused most of it.
+_RISE = 4.0  # factor on d for a step that goes against the forces, too far, or folds a cell
+# Factors after a step that increases the residual strongly: on d, and on the damping of the nodes that caused most.
 _RISE_OVER, _THICKENED, _MOST_OF_IT = 1.5, 4.0, 0.1
-# Change of the medium's thickness at a node after a step, by the share of the forces that was not predicted there.
+# Factor on the damping of a node after a step, by the fraction of the forces that was not predicted there.
 _THICKNESSES = ((0.1, 0.5), (0.3, 1.0), (np.inf, 4.0))
 _THICKEST = 1e3
-_BORNE = 0.5  # share of the forces that the medium may still take in the last step
+_BORNE = 0.5  # largest fraction of the forces that the medium may carry in the last step
 _ACCURACY = 1e-3  # of linear solutions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """A step that was tried: where it leads, with which forces, and how wrong its tangent was."""
+    """A trial step: the new state, its forces, and the error of the tangent's prediction."""
 
     state: FloatArray
     forces: FloatArray
@@ -48,19 +49,20 @@ class _Step:
     lowest: float
     largest_mm: float
     unforeseen_n: FloatArray  # (n,) forces at nodes that the tangent did not predict; 0 for nodes on the plate
-    borne_n: float  # forces that the medium takes
-    after_n: float  # forces out of balance after the step
+    borne_n: float  # forces that the medium carries
+    after_n: float  # residual forces after the step
 
 
 def descend(
     assembler: Assembler, solver: Solver, state: FloatArray, outside: FloatArray, tolerance: Tolerance,
     changed: Callable[[FloatArray, FloatArray], bool], log: Callable[[str], None], is_over: Callable[[], bool],
 ) -> Converged | None:  # fmt: skip
-    """Find the equilibrium to which a body in a viscous medium moves under forces from ``outside`` (equations,), N.
+    """Find the equilibrium that a body in a viscous medium reaches under forces from ``outside`` (equations,), N.
 
-    The rest as in `fe.newton.equilibrium`, but no unknown is prescribed; ``changed`` is called after every step, and
-    ``is_over`` before it, to stop. None if equilibrium is not reached in 400 steps, or a node moves farther than the
-    body is large. As in `fe.newton.Tolerance`, several steps that stay in balance are enough.
+    As `fe.newton.equilibrium`, but without prescribed unknowns. ``changed`` is called after every step; ``is_over`` is
+    called before every step and stops the search. None if equilibrium is not reached in 400 steps, or if a node moves
+    farther than the size of the body. As in `fe.newton.Tolerance`, several consecutive steps within the force tolerance
+    are enough.
     """
     model = assembler.model
     now, damping, thickness = state.copy(), _FIRST, np.ones(len(model.space.nodes_mm))
@@ -90,12 +92,12 @@ def descend(
         now, forces, residual = step.state, step.forces, step.residual
         balance = step.after_n / max(reaction(assembler, forces), 1e-9)
         log(
-            f"    downhill {count}: out of balance {balance:.1e}, step {step.largest_mm:.1e} mm, least det F "
+            f"    viscous descent {count}: residual {balance:.1e}, step {step.largest_mm:.1e} mm, smallest det F "
             f"{step.lowest:.3f}, damping {damping:.1e}"
         )
         moved_mm = float(np.abs(now[: -model.space.pressures]).max())
         if moved_mm > largest_mm:
-            log(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
+            log(f"    stopped: a node has moved by {moved_mm:.0f} mm, more than the size of the body")
             return None
         wrong = step.unforeseen_n / before_n
         damping = max(_LEAST, damping * float(_by(_CHANGES, np.linalg.norm(np.minimum(wrong, _CLIPPED)))))
@@ -113,7 +115,7 @@ def descend(
 
 
 def _by(table: Sequence[tuple[float, float]], values: npt.ArrayLike) -> FloatArray:
-    """The factor of each value: the one beside the first limit that it does not exceed."""
+    """The factor for each value: that of the first limit that the value does not exceed."""
     limits, factors = np.array(table).T
     return np.asarray(factors[np.searchsorted(limits, values)])
 
@@ -122,18 +124,18 @@ def _tried(
     assembler: Assembler, solver: Solver, now: FloatArray, tangent: FloatArray, outside: FloatArray,
     residual: FloatArray, medium: FloatArray,
 ) -> _Step | None:  # fmt: skip
-    """A damped step from a state; None where it goes against the forces or folds a cell. ``medium`` is d V, N/mm."""
+    """A damped step from a state; None if it goes against the forces or folds a cell. ``medium`` is d V, N/mm."""
     right = outside - residual
     right[assembler.idle] = 0.0
     data = tangent.copy()
-    data[assembler.indptr[:-1]] += medium  # the diagonal stands first in its row
+    data[assembler.indptr[:-1]] += medium  # the diagonal is the first entry of each row
     try:
         change = solver.solve(data, right, _ACCURACY)
     except SingularError:
         return None
     moves = assembler.spread(change)
     longest_mm = float(np.abs(moves[: -assembler.model.space.pressures]).max())
-    # Twice the energy of the step in a body that is stiffer by the medium; that of a step uphill is below zero.
+    # Twice the energy of the step, with damping added to the stiffness; negative if the step goes against the forces.
     energy = float((change * right) @ np.where(assembler.force_equations, 1.0, -1.0))
     if not (energy > 0.0 and longest_mm <= _TOO_FAR_MM):
         return None

@@ -1,17 +1,17 @@
-"""Tetrahedra for nearly incompressible tissue: displacement and pressure are two fields (mixed elements).
+"""Mixed tetrahedra for nearly incompressible tissue, with displacement and pressure as two fields.
 
-The weak form, with W(F) the isochoric part of the material law, K the bulk modulus and p the pressure (positive in
-tension), is stationary at the solution of
+With W(F) the isochoric part of the constitutive model, K the bulk modulus and p the pressure (positive in tension), the
+solution is a stationary point of
 
     integral W(F) + p (J - 1) - p^2 / (2 K) dX  -  work of the forces,
 
-which for p = K (J - 1) is the material law itself. Pressure is linear in each tetrahedron and continuous within a
-tissue, and may jump from one tissue to the next. Three choices of displacement:
+which for p = K (J - 1) is the constitutive model itself. Pressure is linear in each tetrahedron, continuous within a
+tissue, and discontinuous between tissues. There are three choices of displacement:
 
-- ``P1``: linear. Alone it is unstable; S = tau / mu0 (M - Mbar) is subtracted, in which M is the pressure's mass matrix
-  and Mbar that of its mean in the cell (Bochev, Dohrmann, Gunzburger 2006, doi:10.1137/S0036142905444482). A small part
-  of the bulk modulus, c mu0, acts in each cell on its own, and only the rest through the pressure: the material law is
-  the same, and single cells scatter less.
+- ``P1``: linear. Alone it is unstable, so S = tau / mu0 (M - Mbar) is subtracted, where M is the mass matrix of the
+  pressure and Mbar that of its mean in the cell (Bochev, Dohrmann, Gunzburger 2006, doi:10.1137/S0036142905444482). A
+  small part of the bulk modulus, c mu0, acts in each cell separately, and only the rest acts through the pressure
+  field. The constitutive model is the same, and the scatter between cells is smaller.
 - ``MINI``: linear and a quartic bubble (Arnold, Brezzi, Fortin 1984, doi:10.1007/BF02576171); stable.
 - ``P2``: quadratic (Taylor, Hood 1973); stable, second order in the strain, and expensive.
 """
@@ -35,18 +35,18 @@ DESCRIPTIONS = {
 }
 
 CROWDED = 0.4
-"""det F below which a cell resists with an energy of its own, K / 3 ln(CROWDED / J)^3, so that it does not fold."""
+"""det F below which the solver adds the energy K / 3 ln(CROWDED / J)^3 to a cell, so that it does not fold."""
 
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-"""Corners of a quadratic tetrahedron's edges, in the order of its nodes 4 to 9."""
+"""Corners of the edges of a quadratic tetrahedron, in the order of its nodes 4 to 9."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Element:
-    """A mixed tetrahedron, tabulated at its q quadrature points, with a displacement functions."""
+    """A mixed tetrahedron with ``a`` displacement functions, tabulated at its q quadrature points."""
 
     name: str
-    weights: FloatArray  # (q,) shares of the cell's volume
+    weights: FloatArray  # (q,) fractions of the cell's volume
     gradients: FloatArray  # (q, a, 3) of the displacement functions, by the reference coordinates (nodes 1, 2 and 3)
     pressure: FloatArray  # (q, 4) pressure functions
     stabilisation: float = 0.0  # tau, no unit; only P1 needs it
@@ -56,7 +56,7 @@ class Element:
 def element(name: str) -> Element:
     """An element by its name, P1, MINI or P2."""
     if name not in _MADE:
-        raise InputError(f"No element '{name}'; there are {', '.join(_MADE)}.")
+        raise InputError(f"Unknown element '{name}'; available are {', '.join(_MADE)}.")
     functions, (barycentric, weights), *constants = _MADE[name]
     return Element(name, weights, np.array([functions(b) for b in barycentric]), barycentric, *constants)
 
@@ -108,7 +108,7 @@ _MADE: Mapping[str, tuple[Any, ...]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Space:
-    """Where the unknowns of a mesh lie."""
+    """Positions and numbering of the unknowns of a mesh."""
 
     nodes_mm: FloatArray  # (n, 3) reference positions of the displacement nodes; a bubble's is its cell's centroid
     cells: IntArray  # (m, a) displacement nodes, the mesh's own four first
@@ -117,7 +117,7 @@ class Space:
 
     @classmethod
     def on(cls, mesh: TetMesh, kind: str, tissue: IntArray) -> Self:
-        """The space of an element on a mesh; ``tissue`` (m,) numbers the cells between which pressure may jump."""
+        """The space of an element on a mesh; pressure is discontinuous between different numbers in ``tissue`` (m,)."""
         points, cells = mesh.points_mm, mesh.cells
         if kind == "P2":
             ends = np.sort(np.concatenate([cells[:, list(edge)] for edge in EDGES]), axis=1)
@@ -134,12 +134,12 @@ class Space:
         return cls(points, np.ascontiguousarray(cells), numbered.reshape(pairs.shape), len(known))
 
     def nodes_on(self, faces: IntArray) -> IntArray:
-        """Displacement nodes (k,) on triangles (n, 3) of the mesh, rising; those in the middle of edges too."""
+        """Displacement nodes (k,) on triangles (n, 3) of the mesh, with those at the midpoints of edges, ascending."""
         corners = np.unique(faces)
         return np.append(corners, self.middles(edges_of(faces))) if self.cells.shape[1] == 10 else corners
 
     def middles(self, ends: IntArray) -> IntArray:
-        """The node in the middle of each edge (k, 2) of a quadratic mesh, given by its corners in rising order."""
+        """The midpoint node of each edge (k, 2) of a quadratic mesh; edges are corners in ascending order."""
         known = np.sort(np.concatenate([self.cells[:, list(edge)] for edge in EDGES]), axis=1)
         weights = np.array([len(self.nodes_mm), 1])
         keys, first = np.unique(known @ weights, return_index=True)
@@ -147,7 +147,7 @@ class Space:
 
 
 def edges_of(faces: IntArray) -> IntArray:
-    """The edges (k, 2) of triangles (n, 3), each once, corners in rising order."""
+    """The edges (k, 2) of triangles (n, 3), each once, corners in ascending order."""
     return np.unique(np.sort(np.concatenate([faces[:, e] for e in ([0, 1], [1, 2], [0, 2])]), axis=1), axis=0)
 
 
@@ -159,10 +159,10 @@ class Model:
     space: Space
     volumes_mm3: FloatArray  # (m,)
     inverse: FloatArray  # (m, 3, 3) reference coordinates by position, 1/mm
-    vectors: FloatArray  # (k, v) of the material laws, see `fe.hyperelastic`
+    vectors: FloatArray  # (k, v) parameters of the constitutive models, see `fe.hyperelastic`
     shear_mpa: FloatArray  # (k,) initial
     bulk_mpa: FloatArray  # (k,)
-    law: IntArray  # (m,) number of each cell's material law
+    law: IntArray  # (m,) number of each cell's constitutive model
 
     @classmethod
     def of(cls, mesh: TetMesh, materials: Materials, element: Element) -> Self:
@@ -182,7 +182,7 @@ class Model:
 
     @property
     def own_bulk_mpa(self) -> FloatArray:
-        """The part of each material's bulk modulus (k,) that acts in each cell on its own; at most half of it."""
+        """The part of each material's bulk modulus (k,) that acts in each cell separately; at most half of it."""
         return np.minimum(self.element.own_volume * self.shear_mpa, 0.5 * self.bulk_mpa)
 
     @property
@@ -203,7 +203,7 @@ class Model:
         return np.asarray(np.einsum("mai,aj,mjk->mik", u, table, self.inverse))
 
     def pressures(self, state: FloatArray) -> FloatArray:
-        """Pressure at each cell's corners (m, 4), MPa: the field's, and the part that acts in the cell on its own."""
+        """Pressure at each cell's corners (m, 4), MPa: that of the field, and the part that acts in each cell alone."""
         volume = np.linalg.det(np.eye(3) + self.gradients(state))
         crowded = np.log(CROWDED / np.clip(volume, 1e-12, CROWDED)) ** 2 / volume
         own = self.own_bulk_mpa[self.law] * (volume - 1.0) - self.bulk_mpa[self.law] * crowded

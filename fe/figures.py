@@ -1,4 +1,4 @@
-"""Figures of the finite-element side; what a figure's docstring says is its caption."""
+"""Figures of meshes, simulations and fits; the docstring of a figure is its caption."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ from fe.result import volume_percentiles
 from fe.solution import LoadState
 
 if TYPE_CHECKING:
-    from fe.fitting import Curve, Fit  # they bring SciPy's statistics: 0.2 s
+    from fe.fitting import Curve, Fit  # imports SciPy's statistics: 0.2 s
 
 _POINTS = 200
 _FLAT_MM = 0.1
-_STEEPEST = 0.05  # cosine between a plate's normal and the slice's: beyond, it is not drawn
-_MARGIN_MM = 7.0  # around what is drawn; the letters stand there
+_STEEPEST = 0.05  # smallest component of the plate's normal along the normal force at which the plate is drawn
+_MARGIN_MM = 7.0  # around the mesh, for the letters
 _UNKNOWN = "#c9ced6"
 
 
@@ -41,7 +41,10 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def stress_stretch(curves: "Sequence[Curve]", fitted: "Fit") -> Figure:
-    """Measured nominal stress (points) and the fitted law (lines; dashed: not stable, by Drucker), by kind of test."""
+    """Measured nominal stress (points) and the fitted model (lines), by kind of test.
+
+    Dashed lines: the model is not stable there (Drucker).
+    """
     figure, (axes,) = chart()
     for curve, colour in zip(curves, cycle(REGION_COLOURS), strict=False):
         low, high = fitted.reached[curve.mode]
@@ -61,11 +64,11 @@ def stress_stretch(curves: "Sequence[Curve]", fitted: "Fit") -> Figure:
 
 
 def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
-    """Maximum shear strain on the slice through the bone's lowest point, along the plate's normal and the shear.
+    """Maximum shear strain in a slice through the lowest point of the bone, along the plate's normal and the shear.
 
-    The directions are those of the first load, where loads have their own. Cells are cut in the unloaded configuration
-    and drawn where they are under load; the dashed line is the plate. The colour scale ends at the 99th percentile of
-    the volume, over all loads.
+    If loads have their own directions, those of the first load are used. Cells are cut in the unloaded configuration
+    and drawn in their deformed position; the dashed line is the plate. The colour scale ends at the 99th percentile
+    (by volume) over all loads.
     """
     axes = states[0].plate_axes
     assert axes is not None
@@ -79,7 +82,7 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
 def _along_plate(
     mesh: TetMesh, state: LoadState, axes: FloatArray, on_slice_mm: FloatArray
 ) -> tuple[float, float] | None:
-    """Height of the plate where the slice's shear coordinate is 0, and its slope; None for one along the slice."""
+    """Height of the plate at shear coordinate 0 of the slice, and its slope; None if it cannot be drawn as a line."""
     assert state.plate_axes is not None
     on_plate = ((mesh.points_mm + state.u_mm)[state.on_plate] @ axes).mean(axis=0)
     turned = Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]
@@ -92,20 +95,20 @@ def _along_plate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slice:
-    """A field on a mesh, to be drawn on a slice; a plate's ``face`` is a dashed line."""
+    """A field on a mesh that is drawn in a slice; the ``face`` of a plate is a dashed line."""
 
     title: str
-    u_mm: FloatArray  # (n, 3) displacement of the mesh's nodes, LPS: cells are drawn where it puts them
-    max_shear: FloatArray  # (m,) of the cells; one with NaN is drawn grey
-    face: tuple[float, float] | None = None  # height along the normal force where the shear's coordinate is 0; slope
+    u_mm: FloatArray  # (n, 3) displacement of the mesh's nodes, LPS: cells are drawn in their deformed position
+    max_shear: FloatArray  # (m,) of the cells; NaN is drawn grey
+    face: tuple[float, float] | None = None  # height along the normal force at shear coordinate 0; slope
 
 
 def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> Figure:
-    """Fields on one slice, in one colour scale that ends at the 99th percentile of the volume.
+    """Fields in one slice, with one colour scale that ends at the 99th percentile (by volume).
 
     Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left. ``axes`` (3,
-    3) are the plate's: columns are the directions of the normal force, of shear, and their cross product, LPS.
-    ``point_mm`` (3,) lies on the slice, reference configuration, LPS mm.
+    3) are those of the plate: columns are the directions of the normal force, of shear, and their cross product, LPS.
+    ``point_mm`` (3,) lies in the slice, reference configuration, LPS mm.
     """
     cuts = [cut(mesh, field.u_mm, axes, point_mm) for field in fields]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
@@ -137,17 +140,17 @@ def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_
 
 
 def _lowest_bone_point(mesh: TetMesh, axes: FloatArray) -> FloatArray:
-    """Where the bone's surface lies furthest along the plate's outward normal, LPS mm; the middle of a flat bone."""
+    """Point of the bone's surface furthest along the plate's outward normal, LPS mm; the mean if there are several."""
     points = mesh.points_mm[np.unique(mesh.facets[BONE])] if BONE in mesh.facets else mesh.points_mm
     height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + _FLAT_MM].mean(axis=0))
 
 
 def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray) -> tuple[IntArray, list[FloatArray]]:
-    """Cells (k,) cut by the plane of the plate's first two axes, and each one's polygon (3 or 4, 2) under load.
+    """Cells (k,) cut by the plane of the plate's first two axes, and the deformed polygon (3 or 4, 2) of each.
 
-    Polygons are along shear and normal force, mm; ``u_mm`` (n, 3) is the displacement of the mesh's nodes, LPS; the
-    rest as in `slice_sheet`.
+    Coordinates of polygons are along the shear and the normal force, mm. ``u_mm`` (n, 3) is the displacement of the
+    mesh's nodes, LPS. The other parameters are as in `slice_sheet`.
     """
     height = (mesh.points_mm - point_mm) @ axes[:, 2]
     height = np.where(height == 0.0, 1e-9, height)
@@ -156,7 +159,7 @@ def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray)
     cells = np.flatnonzero(sides.any(axis=1) & ~sides.all(axis=1))
     polygons = []
     for nodes, side in zip(mesh.cells[cells], sides[cells], strict=True):
-        # around the section: two pairs of edges share a corner, so that the polygon does not cross itself
+        # in order around the section, so that the polygon does not cross itself
         pairs = [(a, b) for a in nodes[side] for b in nodes[~side]]
         if len(pairs) == 4:
             pairs = [pairs[0], pairs[1], pairs[3], pairs[2]]
@@ -166,7 +169,7 @@ def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray)
 
 
 def force_displacement(states: Sequence[LoadState]) -> Figure:
-    """Force of the plate over its displacement from the first touch on, along normal (left) and shear (right)."""
+    """Force of the plate over its displacement from first contact on, along the normal (left) and the shear (right)."""
     figure, spots = chart(2)
     for axes, axis, name in zip(spots, (0, 1), ("normal", "shear"), strict=True):
         for state, colour in zip(states, cycle(REGION_COLOURS), strict=False):
@@ -178,7 +181,7 @@ def force_displacement(states: Sequence[LoadState]) -> Figure:
 
 
 def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
-    """The mesh on a slice through the bone's lowest point, coloured by tissue."""
+    """The mesh in a slice through the lowest point of the bone, coloured by tissue."""
     figure, (panel,) = chart()
     cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate.axes))
     for (name, members), colour in zip(mesh.regions.items(), cycle(REGION_COLOURS), strict=False):
@@ -192,7 +195,10 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
 
 
 def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> Figure:
-    """Quantities over their limits (1: the grey line), by the size of the cells, the cube root of their mean volume."""
+    """Quantities over the cell size (cube root of the mean cell volume), each divided by its extrapolated limit.
+
+    The grey line is 1.
+    """
     figure, (axes,) = chart()
     for (name, (values, limit)), colour in zip(curves.items(), cycle(REGION_COLOURS), strict=False):
         style = "-" if "travel" in name else "--"
@@ -202,6 +208,6 @@ def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[f
         axes.plot(h, 1.0 + slope * h**limit.order / limit.limit, ":", color=colour, linewidth=1.2)
     axes.axhline(1.0, color="#9aa5b1", linewidth=1.0)
     axes.set_xlim(0.0, 1.05 * max(sizes_mm))
-    label_axes(axes, "size of the cells, mm", "figure over its limit")
+    label_axes(axes, "cell size, mm", "value / extrapolated limit")
     axes.legend(fontsize=8, frameon=False)
     return figure

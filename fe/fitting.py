@@ -1,4 +1,4 @@
-"""Stretch-stress curves of mechanical tests, and a material law's parameters from them, with confidence intervals."""
+"""Stretch-stress curves of mechanical tests, and model parameters fitted to them, with confidence intervals."""
 
 import csv
 import itertools
@@ -19,7 +19,7 @@ _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogde
 _MOSTLY = 0.8
 _MOST = 60.0  # no curve determines an exponent beyond this
 _SOFTEST = 1e-3  # least C10 of a polynomial, relative to that of the neo-Hookean model that fits the curves best
-_ABSURD = 1e-4  # curves of a material with a positive modulus are refused less often than this
+_ABSURD = 1e-4  # probability that curves of a material with a positive modulus are refused
 _STRESS = {
     "nominal_stress_kpa": (1e-3, False), "nominal_stress_mpa": (1.0, False),
     "true_stress_kpa": (1e-3, True), "true_stress_mpa": (1.0, True),
@@ -46,16 +46,17 @@ class Curve:
 
 
 def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
-    """Curves of a CSV file, one for each kind of test.
+    """Read the curves of a CSV file, one for each kind of test.
 
     Columns: ``stretch``; one of ``nominal_stress_kpa``, ``nominal_stress_mpa``, ``true_stress_kpa``,
     ``true_stress_mpa`` (nominal: force over undeformed area; true: over deformed); and ``test``, a name of
-    `fe.materials.MODES`, unless ``mode`` gives it for the whole file. In other columns nothing is read.
+    `fe.materials.MODES`, unless ``mode`` gives it for the whole file. Other columns are ignored.
 
     Raises
     ------
     InputError
-        If the file cannot be read, a column is missing or ambiguous, or a value is no number; with its line.
+        If the file cannot be read, a column is missing or ambiguous, or a value is not a number (the message gives its
+        line).
     """
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
@@ -63,18 +64,21 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
             rows = list(reader)
             columns = [c.strip().lower() for c in reader.fieldnames or []]
     except (OSError, UnicodeDecodeError, csv.Error) as failure:
-        raise InputError(f"Cannot read the curve {path}: {failure}.") from failure
+        raise InputError(f"{path}: the curve cannot be read ({failure}).") from failure
     stress = [c for c in columns if c in _STRESS]
     if len(columns) == 1 and ";" in columns[0]:
-        raise InputError(f"{path}: columns are divided by semicolons; write it with commas (and points in numbers).")
+        raise InputError(f"{path}: columns are separated by semicolons; use commas (and decimal points in numbers).")
     if "stretch" not in columns or len(stress) != 1:
         raise InputError(
-            f"{path}: a curve needs a column 'stretch' and one of {', '.join(_STRESS)}, so that unit and kind of "
-            f"stress are said (stretch = 1 + strain); its columns are {', '.join(columns) or 'none'}."
+            f"{path}: a curve needs a column 'stretch' (1 + strain) and exactly one of {', '.join(_STRESS)} (kind and "
+            f"unit of stress); its columns are {', '.join(columns) or 'none'}."
         )
     mode = None if mode is None else mode.strip().lower()
     if mode is None and "test" not in columns:
-        raise InputError(f"{path}: say which test it is: {', '.join(MODES)} (--test, or a column 'test').")
+        raise InputError(
+            f"{path}: the kind of test is missing. Add a column 'test', or give one test for the whole file "
+            f"({', '.join(MODES)})."
+        )
     scale, true = _STRESS[stress[0]]
     tests: dict[str, list[tuple[float, float]]] = {}
     for line, row in enumerate(rows, start=2):
@@ -84,45 +88,47 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
         except ValueError as failure:
             raise InputError(f"{path}, line {line}: {failure}.") from failure
         if not (np.isfinite([stretch, value]).all() and stretch > 0.0):
-            raise InputError(f"{path}, line {line}: a stretch is positive, and both numbers finite; got {cells}.")
+            raise InputError(
+                f"{path}, line {line}: the stretch must be positive, and both numbers must be finite; got {cells}."
+            )
         name = mode or cells["test"].lower()
         if name not in MODES:
-            raise InputError(f"{path}, line {line}: no test '{name}'; there are {', '.join(MODES)}.")
+            raise InputError(f"{path}, line {line}: unknown test '{name}'; available are {', '.join(MODES)}.")
         tests.setdefault(name, []).append((stretch, value / stretch if true else value))
     if not tests:
-        raise InputError(f"{path}: no row under the header.")
+        raise InputError(f"{path}: the table has no rows below the header.")
     return [Curve(name, *np.array(points).T) for name, points in tests.items()]
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A fitted number and its 95 % confidence interval."""
+    """A fitted parameter and its 95 % confidence interval."""
 
     name: str
     value: float
     low: float
     high: float
-    at_bound: bool = False  # the curves alone would have it below what a material law may have: ``value`` is the bound
+    at_bound: bool = False  # the unconstrained fit is below the smallest admissible value, and ``value`` is that bound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A material law fitted to curves.
+    """A constitutive model fitted to curves.
 
     Attributes
     ----------
     parameters : tuple of Parameter
-        Moduli in MPa; an Ogden term's ``mu`` is its initial shear modulus.
+        Moduli in MPa; ``mu`` of an Ogden term is its initial shear modulus.
     r2 : mapping of mode to float
-        1 less the residual's sum of squares over that of the stress about its mean, by kind of test.
+        Coefficient of determination by kind of test: 1 minus the residual sum of squares over the total sum of squares.
     rmse_mpa : float
         Of the nominal stress over all points.
     others : tuple of Material
-        Material laws of the same form that fit these curves equally well.
+        Other parameters of the same model that fit these curves equally well.
     stable : mapping of mode to (float, float)
-        Stretches between which the material law is stable, of 1/5 to 5 (`Material.stable_range`).
+        Stretches between which the model is stable, within 1/5 to 5 (`Material.stable_range`).
     reached : mapping of mode to (float, float)
-        Least and greatest stretch of the curves.
+        Smallest and largest stretch of the curves.
     """
 
     material: Material
@@ -135,19 +141,19 @@ class Fit:
 
     @property
     def stable_where_measured(self) -> bool:
-        """Whether the material law is stable at every stretch of the curves."""
+        """Whether the model is stable at every stretch of the curves."""
         return all(self.stable[m][0] <= low and high <= self.stable[m][1] for m, (low, high) in self.reached.items())
 
 
 @dataclass(frozen=True, slots=True)
 class _Law:
-    """A material law as the fit sees it: its kind, names of its parameters, and their vector."""
+    """A constitutive model as it is fitted: class, names of the parameters, and their vector."""
 
     made: type[Material]
     names: tuple[str, ...]
     vector: Callable[[FloatArray], FloatArray]
-    exponents: int = 0  # of the last parameters, those in which the stress is not linear
-    bounded: bool = False  # the first parameter is kept positive, and the stress is linear in all
+    exponents: int = 0  # number of the last parameters, in which the stress is not linear
+    bounded: bool = False  # the first parameter is kept positive, and the stress is linear in all parameters
 
 
 def _polynomial(*names: str) -> _Law:
@@ -169,42 +175,42 @@ LAWS: Mapping[str, _Law] = {
     "Ogden-3": _ogden(3),
     "Hencky": _Law(Hencky, ("mu",), lambda values: values[0] * np.eye(OGDEN)[HENCKY]),
 }
-"""Material laws that can be fitted. Isihara's is Yeoh's without C30."""
+"""Constitutive models that can be fitted. Isihara is Yeoh without C30."""
 
 
 def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
-    """Fit a material law to curves of an incompressible solid by least squares of the nominal stress.
+    """Fit a constitutive model to curves of an incompressible solid by least squares of the nominal stress.
 
     Parameters
     ----------
     curves : sequence of Curve
         All are fitted together, every point with the same weight.
     law : str
-        A name of `LAWS`; case does not count.
+        A name of `LAWS`; case is ignored.
     nu : float
-        Poisson's ratio of the material made; the fit itself takes the tissue as incompressible.
+        Poisson's ratio of the resulting material; the fit itself assumes that the tissue is incompressible.
 
     Raises
     ------
     InputError
-        If points are too few, or none lies away from a stretch of 1; if the curves do not determine the parameters, or
+        If there are too few points or too few stretches other than 1; if the curves do not determine the parameters, or
         imply an initial shear modulus that is not positive.
 
     Notes
     -----
-    A curve of one test may leave two exponents open: in uniaxial compression, alpha and about -alpha / 2 give nearly
-    the same stress. Of optima that an F test at 5 % does not distinguish, one whose exponents are all positive is
-    taken, and the rest are named.
+    The curve of one test may not determine the exponents: in uniaxial compression, alpha and about -alpha / 2 give
+    nearly the same stress. Among optima that an F test at 5 % does not distinguish, one with only positive exponents is
+    chosen, and the others are reported.
 
-    Intervals are those of linearised regression with Student's t: errors are taken as independent and of one standard
-    deviation; what a curve's points share, such as a wrong area, is not covered. Ogden exponents start from the four
-    best of the combinations of eight values.
+    Intervals are those of linearised regression with Student's t. They assume independent errors of equal standard
+    deviation; an error that all points of a curve share, such as a wrong area, is not covered. Fits of Ogden exponents
+    start from the four best combinations of eight values.
 
-    C10, half the initial shear modulus, is positive in any material law, but a curve that is steep only at its end may
-    leave it open. It is kept at a thousandth or more of that of the neo-Hookean model which fits the curves best. An
-    interval reaches w below the lower, and w above the higher, of the values with and without that bound, w being the
-    half width without it; C10's ends at 0. So it covers the truth at least as often. Curves are refused whose C10 is so
-    far below 0 as chance has it in less than one in 10,000 of the curves of a true material law.
+    C10, half the initial shear modulus, must be positive, but a curve that is steep only at its end may not determine
+    it. Its lower bound is a thousandth of C10 of the best neo-Hookean fit. Let w be the half width of a parameter's
+    interval without the bound. With the bound, the interval extends from w below the lower to w above the higher of the
+    two values with and without the bound; that of C10 ends at 0. Its coverage is therefore at least as high. Curves are
+    refused if C10 is so far below 0 that this would occur by chance in less than one of 10,000 curves of a valid model.
     """
     sought, curves = _checked(curves, law, nu)
     count = len(sought.names)
@@ -226,18 +232,20 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     best, others = _chosen(sought, optima, len(stress))
     if sought.exponents and np.abs(best.x[-sought.exponents :]).max() > _MOST:
         raise InputError(
-            f"{law}: the best exponent is beyond {_MOST:g}; these curves do not determine it. Use fewer terms."
+            f"{law}: these curves do not determine the exponents (the best fit exceeds {_MOST:g}). Use fewer terms."
         )
     deviations = _deviations(best.x, best.jac, best.fun)
     if deviations is None:
-        raise InputError(f"{law}: these curves do not determine its parameters (singular); use a model with fewer.")
+        raise InputError(
+            f"{law}: these curves do not determine the parameters (singular system). Use a model with fewer parameters."
+        )
     values, parameters = _with_intervals(sought, best, deviations, curves, stress)
     try:
         material = sought.made(sought.vector(values), nu)
     except InputError as unusable:
         raise InputError(
-            f"The best fit is no usable material law ({unusable}) Give points nearer to a stretch of 1, or fit one "
-            "with fewer parameters."
+            f"{law}: the best fit is not a valid material. {unusable} Add points closer to a stretch of 1, or use a "
+            "model with fewer parameters."
         ) from unusable
     residual = modelled(values) - stress
     return Fit(
@@ -249,12 +257,12 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
 
 
 def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[Curve]]:
-    """The material law of that name, and one curve for each kind of test; or why they cannot be used."""
+    """The model of that name, and one curve for each kind of test; InputError if they cannot be used."""
     named = {name.lower(): name for name in LAWS}
     if law.lower() not in named:
-        raise InputError(f"No material law '{law}' to fit; there are {', '.join(LAWS)}.")
+        raise InputError(f"Unknown model '{law}'; models that can be fitted are {', '.join(LAWS)}.")
     if not 0.0 <= nu <= HIGHEST_NU:
-        raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
+        raise InputError(f"Poisson's ratio must be between 0 and {HIGHEST_NU}; got {nu:g}.")
     sought, joined = LAWS[named[law.lower()]], []
     for mode in dict.fromkeys(curve.mode for curve in curves):
         mine = [curve for curve in curves if curve.mode == mode]
@@ -264,13 +272,13 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
     if len(stress) < count + 2 or apart < count:
         raise InputError(
-            f"{law} has {count} parameters and needs {count + 2} points or more, {count} of them at different "
-            f"stretches other than 1; got {len(stress)} points, {apart} such stretches."
+            f"{law} has {count} parameters. It needs at least {count + 2} points and {count} different stretches other "
+            f"than 1; got {len(stress)} points and {apart} such stretches."
         )
     if np.mean(stress * (stretch - 1.0) < 0.0) > _MOSTLY:
         raise InputError(
-            "The stress has the sign opposite to the stretch: it must be above 0 in tension (stretch over 1) and below "
-            "0 in compression (stretch under 1). A column of strain is not one of stretch: stretch = 1 + strain."
+            "The stress has the wrong sign: it must be positive in tension (stretch above 1) and negative in "
+            "compression (stretch below 1). If the column contains strain, convert it: stretch = 1 + strain."
         )
     if not stress.any():
         raise InputError("The stress is 0 at every point of the curves.")
@@ -280,17 +288,17 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
 def _with_intervals(
     law: _Law, best: OptimizeResult, deviations: FloatArray, curves: Sequence[Curve], stress: FloatArray
 ) -> tuple[FloatArray, tuple[Parameter, ...]]:
-    """The best values, the first kept positive where it has to be, and their 95 % confidence intervals."""
+    """The best values, with the first kept positive if required, and their 95 % confidence intervals."""
     values, least = best.x, np.full(len(best.x), -np.inf)
     freedom = len(stress) - len(values)
     widths = student.ppf(0.975, freedom) * deviations
     if law.bounded:
         absurd = values[0] + student.isf(_ABSURD, freedom) * deviations[0] <= 0.0
-        if values[0] <= widths[0] and not absurd:  # zero is in its interval: the curves leave it open
+        if values[0] <= widths[0] and not absurd:  # its interval contains zero: the curves do not determine it
             size = float(np.sqrt(np.mean(stress**2)))
             unit = np.concatenate([nominal_stress(np.eye(OGDEN)[0], c.stretch, c.mode) for c in curves])
-            softest = _SOFTEST * float(unit @ stress / (unit @ unit))  # not above 0 where no positive modulus fits
-            columns = best.jac * size  # times the values they are the stress
+            softest = _SOFTEST * float(unit @ stress / (unit @ unit))  # not positive if no positive modulus fits
+            columns = best.jac * size  # their product with the values is the stress
             if values[0] < softest:
                 rest, *_ = np.linalg.lstsq(columns[:, 1:], stress - columns[:, 0] * softest, rcond=None)
                 values = np.array([softest, *rest])
@@ -304,7 +312,7 @@ def _with_intervals(
 
 
 def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
-    """Share of the stress' variance that the material law explains, by kind of test."""
+    """Fraction of the variance of the stress that the model explains, by kind of test."""
     r2, ends = {}, np.cumsum([len(c.stress_mpa) for c in curves])
     for curve, left in zip(curves, np.split(residual, ends[:-1]), strict=True):
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
@@ -313,7 +321,7 @@ def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
 
 
 def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: FloatArray) -> list[FloatArray]:
-    """First guesses: moduli by linear least squares, for each combination of exponents where there are any."""
+    """First guesses: moduli by linear least squares, for each combination of exponents."""
     linear = len(law.names) - law.exponents
     starts = []
     for exponents in itertools.combinations(_EXPONENTS, law.exponents):
@@ -326,7 +334,7 @@ def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: Flo
 def _chosen(
     law: _Law, optima: Sequence[OptimizeResult], points: int
 ) -> tuple[OptimizeResult, tuple[OptimizeResult, ...]]:
-    """The optimum to report, and those that the data do not distinguish from it."""
+    """The reported optimum, and those that the data do not distinguish from it."""
     ranked = sorted(optima, key=lambda o: o.cost)
     different: list[OptimizeResult] = []
     freedom, exponents = points - len(law.names), slice(len(law.names) - law.exponents, None)
@@ -340,7 +348,7 @@ def _chosen(
 
 
 def _deviations(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:
-    """Standard deviations of the values; None where the curves do not determine them."""
+    """Standard deviations of the values; None if the curves do not determine them."""
     scaled = jacobian * np.maximum(np.abs(values), 1e-300)
     lengths = np.linalg.norm(scaled, axis=0)
     if not (lengths > 0.0).all():

@@ -1,4 +1,4 @@
-"""Names of `dvc` that a user of `fe` needs as well."""
+"""Names of `dvc` that users of `fe` also need."""
 
 from dvc import TetMesh
 from dvc.errors import InputError, MrstrainError, OutputError, WorkerError

@@ -1,17 +1,17 @@
-"""Response of an isotropic hyperelastic solid at a point, in its principal frame (numba kernels).
+"""Response of an isotropic hyperelastic solid at a point, in the principal frame (numba kernels).
 
 With F = U diag(s) V^T, logarithmic stretches e_i = ln s_i and their isochoric part ebar_i = e_i - sum(e) / 3,
 
     W(F, p) = Wbar(ebar) + p (J - 1),
     Wbar = sum_k C_k0 (I1bar - 3)^k + mu_H sum_i ebar_i^2 + sum_q 2 mu_q / alpha_q^2 (sum_i exp(alpha_q ebar_i) - 3),
 
-I1bar = sum_i exp(2 ebar_i): Yeoh's polynomial, Hencky's quadratic, Ogden's terms. One sum holds every material law, so
-there is one kernel. A law is a vector (C10, C20, C30, mu_H, mu_1, alpha_1, mu_2, alpha_2, ...), MPa but for the alphas,
-in which mu_q is the term's initial shear modulus. p is the pressure-like multiplier of the volume, MPa, positive in
-tension.
+I1bar = sum_i exp(2 ebar_i): Yeoh's polynomial, Hencky's quadratic form and Ogden's terms. The sum contains every
+constitutive model, so one kernel serves all. A model is a vector (C10, C20, C30, mu_H, mu_1, alpha_1, mu_2, alpha_2,
+...), MPa except the alphas, where mu_q is the initial shear modulus of the term. p is the pressure-like Lagrange
+multiplier of the volume, MPa, positive in tension.
 
-The first Piola-Kirchhoff stress of an isotropic solid is P = U diag(dW/ds) V^T, and its derivative has in the principal
-frame only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, section 6.1.4)
+The first Piola-Kirchhoff stress of an isotropic solid is P = U diag(dW/ds) V^T. In the principal frame, its derivative
+has only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, section 6.1.4)
 
     A_iijj = d2W / ds_i ds_j,
     A_ijij + A_ijji = (W_i - W_j) / (s_i - s_j),   A_ijij - A_ijji = (W_i + W_j) / (s_i + s_j),   i != j.
@@ -23,9 +23,9 @@ from numba import njit
 from dvc.arrays import FloatArray
 
 POLYNOMIAL, HENCKY, OGDEN = 0, 3, 4
-"""Where a material law's vector holds C10; mu_H; and its first Ogden pair."""
+"""Positions of C10, of mu_H, and of the first Ogden pair in the parameter vector of a constitutive model."""
 
-_EQUAL = 1e-5  # relative distance of principal stretches below which the quotient's limit is used, in error by 1e-10
+_EQUAL = 1e-5  # relative difference of principal stretches below which the limit of the quotient is used (error 1e-10)
 _SWEEPS = 30
 
 
@@ -62,7 +62,7 @@ def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: Floa
                 energy += 2.0 * mu / alpha**2 * rise
                 slope[i] += 2.0 * mu / alpha * (rise + 1.0)
                 curvature[i, i] += 2.0 * mu * (rise + 1.0)
-    # ebar is e less its mean: both derivatives are projected on what has no trace.
+    # ebar is e minus its mean: both derivatives are projected onto traceless tensors.
     trace = (slope[0] + slope[1] + slope[2]) / 3.0
     rows = curvature.sum(axis=1) / 3.0
     whole = rows.sum() / 3.0
@@ -89,7 +89,7 @@ def along(law: FloatArray, strains: FloatArray, axes: FloatArray) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def least_stiffness(law: FloatArray, strains: FloatArray) -> FloatArray:
-    """Least eigenvalue (n,) MPa of d2Wbar/de2 at e (n, 3), over changes that keep the volume: Drucker's condition."""
+    """Smallest eigenvalue (n,) MPa of d2Wbar/de2 at e (n, 3), for isochoric changes: Drucker's condition."""
     slope, c = np.empty(3), np.empty((3, 3))
     stiffness = np.empty(len(strains))
     for n in range(len(strains)):
@@ -109,7 +109,7 @@ def _product(F: FloatArray, i: int, j: int) -> float:
 
 @njit(inline="always", error_model="numpy")
 def _turned(V: FloatArray, p: int, q: int, at_p: float, at_q: float, off: float) -> tuple[float, float, float]:
-    """Turn columns p and q of V by the angle that clears the entry ``off`` between them; its tangent, cosine, sine."""
+    """Rotate columns p and q of V by the angle that eliminates the entry ``off``; its tangent, cosine and sine."""
     apart = at_q - at_p
     root = np.sqrt(apart * apart + 4.0 * off * off)
     tangent = 2.0 * off / (apart + root if apart >= 0.0 else apart - root) if root > 0.0 else 0.0
@@ -123,7 +123,7 @@ def _turned(V: FloatArray, p: int, q: int, at_p: float, at_q: float, off: float)
 
 @njit(cache=True, error_model="numpy")
 def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) -> float:
-    """Write U, s and V of F = U diag(s) V^T (3, 3) unless det F <= 0, by Jacobi's rotations of F^T F; return det F."""
+    """Write U, s and V of F = U diag(s) V^T (3, 3) unless det F <= 0, by Jacobi rotations of F^T F; return det F."""
     J = (
         F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
         - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
@@ -160,8 +160,9 @@ def principal_response(
 ) -> float:  # fmt: skip
     """W(F, p) in MPa at principal stretches ``s`` (3,), with its stress and tangent in the principal frame.
 
-    ``bulk`` is dp/dJ (MPa), 0 for a pressure that is a field of its own. Written: ``stress`` (3,) = W_i; ``direct`` (3,
-    3) with A_ijij, A_iiii on its diagonal; ``swapped`` (3, 3, 2) with A_iijj first and A_ijji second, i != j.
+    ``bulk`` is dp/dJ (MPa), 0 if pressure is a separate field. The results are written into ``stress`` (3,) = W_i;
+    ``direct`` (3, 3) = A_ijij, with A_iiii on its diagonal; and ``swapped`` (3, 3, 2) = A_iijj first and A_ijji second,
+    i != j.
     """
     e, slope, curvature = np.empty(3), np.empty(3), np.empty((3, 3))
     for i in range(3):
@@ -191,7 +192,7 @@ def principal_response(
 def stress_and_tangent(
     law: FloatArray, bulk: float, gradients: FloatArray, energy: FloatArray, stress: FloatArray, tangent: FloatArray
 ) -> None:
-    """As `fe.materials.Material`, MPa; the volume's part is bulk / 2 (J - 1)^2, and all is NaN where det F <= 0."""
+    """As `fe.materials.Material`, MPa; the volumetric part is bulk / 2 (J - 1)^2, and all is NaN where det F <= 0."""
     U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     principal, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
     for n in range(len(gradients)):

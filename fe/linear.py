@@ -1,8 +1,8 @@
-"""Direct solution of the solver's symmetric, indefinite systems: the one file that knows which library does it.
+"""Direct solution of symmetric, indefinite systems; the only file that depends on the library.
 
-MKL's PARDISO where it runs (x86-64); elsewhere NGSolve's sparse Cholesky where it is installed, else SciPy's SuperLU.
-Factorisations take most of a simulation's time, so PARDISO makes them in single precision, and an old one is used for
-as long as that is quicker: either way as the preconditioner of an iterative solution in double.
+The library is MKL's PARDISO on x86-64; elsewhere NGSolve's sparse Cholesky if it is installed, otherwise SciPy's
+SuperLU. Factorisations take most of the time of a simulation. PARDISO therefore factorises in single precision, and a
+factorisation is reused as long as that is faster; it then preconditions an iterative solution in double precision.
 """
 
 import platform
@@ -20,11 +20,11 @@ from scipy.sparse import linalg
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import MrstrainError
 
-_MOST_STEPS = 10  # of the iterative method: as long as a factorisation, on the meshes that are common here
-_FINE = 1e-8  # residual of a solution by the matrix's own factors
-# PARDISO's own choices for this kind of matrix, which have to be named where one of them is changed (counted from 1):
-# METIS, least pivots of 1e-8, neither scaling nor matching. Changed: (21) pivots are taken on the diagonal as they
-# come, and not in pairs (Bunch and Kaufman), and (28) single precision.
+_MOST_STEPS = 10  # of the iterative method; takes as long as a factorisation on typical meshes
+_FINE = 1e-8  # residual of a solution with the factors of the matrix itself
+# PARDISO's defaults for this kind of matrix (counted from 1), which must all be set if one is changed: METIS, smallest
+# pivots of 1e-8, neither scaling nor matching. Changed: (21) diagonal pivoting in place of Bunch-Kaufman pivots, and
+# (28) single precision.
 _IN_SINGLE = {1: 1, 2: 2, 8: 0, 10: 8, 11: 0, 13: 0, 21: 0, 28: 1}
 
 
@@ -59,7 +59,7 @@ class _Pardiso:
         return size * np.asarray(solution, dtype=np.float64)
 
     def _call(self, phase: int, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """What `PyPardisoSolver` does, without a copy of the pattern at every call."""
+        """As `PyPardisoSolver`, without a copy of the pattern at every call."""
         solution, error, one = np.zeros_like(right), c_int32(0), byref(c_int32(1))
         kind, which, size = (byref(c_int32(number)) for number in (self._solver.mtype, phase, self.size))
         ia, ja, perm, iparm = (
@@ -79,7 +79,7 @@ class _Pardiso:
 
 
 class _NGSolve:
-    """L D L^T without pivoting, of the lower triangle; ordered and analysed once."""
+    """L D L^T of the lower triangle without pivoting; ordered and analysed once."""
 
     rough = False
 
@@ -91,7 +91,7 @@ class _NGSolve:
         counted = np.arange(len(indices), dtype=np.float64)
         self._matrix = la.SparseMatrixd.CreateFromCOO(indices.tolist(), columns.tolist(), counted.tolist(), size, size)
         self._values = self._matrix.AsVector().FV().NumPy()
-        self._order = self._values.astype(np.int64)  # where the library keeps which entry
+        self._order = self._values.astype(np.int64)  # position of each entry in the library
         self._inverse: Any = None
 
     def factorise(self, data: FloatArray) -> None:
@@ -140,7 +140,8 @@ class _SuperLU:
 
 
 Factors = _Pardiso | _NGSolve | _SuperLU
-"""A symmetric matrix of fixed pattern: `factorise` takes new values of its upper triangle, in the pattern's order."""
+"""A symmetric matrix of fixed pattern: `factorise` takes new values of its upper triangle, in the order of the pattern.
+"""
 
 
 def factors(
@@ -148,7 +149,7 @@ def factors(
 ) -> Factors:
     """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
 
-    ``threads`` and ``rough``, for single precision, are PARDISO's; ``library`` is the fastest here by default.
+    ``threads`` and ``rough`` (single precision) apply to PARDISO; ``library`` is by default the fastest available.
     """
     if (chosen := library or _fastest()) == "pardiso":
         return _Pardiso(indptr, indices, threads, rough)
@@ -162,7 +163,7 @@ def _fastest() -> str:
 
 
 def self_test() -> str:
-    """Solve a small system; return a sentence on what came out, for `mrstrain doctor`."""
+    """Solve a small system; return a sentence with the result, for `mrstrain doctor`."""
     A = sparse.diags([4.0, -1.0], [0, 1], shape=(100, 100), format="csr")
     A.sort_indices()
     solver = factors(A.indptr.astype(np.int64), A.indices.astype(np.int64))
@@ -171,16 +172,16 @@ def self_test() -> str:
     solver.close()
     whole = A + sparse.triu(A, 1).T
     if np.abs(whole @ x - 1.0).max() > _FINE:
-        raise MrstrainError(f"{_fastest()} solved a hundred equations wrongly.")
+        raise MrstrainError(f"{_fastest()} gave a wrong solution of a hundred equations.")
     return f"{_fastest()} solved a hundred equations"
 
 
 class Solver:
-    """Solves with matrices that change a little from one to the next; ``factorisations`` and ``steps`` count the work.
+    """Solves systems whose matrix changes little from one to the next; ``factorisations`` and ``steps`` count the work.
 
-    The generalised conjugate residual method (Eisenstat, Elman, Schultz 1983, doi:10.1137/0720023), preconditioned by
-    the last matrix that was factorised. Where it converges too slowly the current matrix is factorised, first in single
-    precision; and where that is not enough, in double until `forget`.
+    It uses the generalised conjugate residual method (Eisenstat, Elman, Schultz 1983, doi:10.1137/0720023),
+    preconditioned by the last factorised matrix. If it converges too slowly, the current matrix is factorised in single
+    precision. If that is not enough, double precision is used until `forget` is called.
     """
 
     def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1) -> None:
@@ -188,12 +189,12 @@ class Solver:
         self._factors = self._new(rough=True)
         self._began_rough = self._factors.rough
         self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr))
-        self._diagonal = indptr[:-1]  # the first of each row
+        self._diagonal = indptr[:-1]  # the first entry of each row
         self._known = False
         self.factorisations, self.steps = 0, 0
 
     def solve(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray:
-        """Solve to a residual below ``tolerance`` times that of zero; 1e-8 if that takes a factorisation."""
+        """Solve to a relative residual below ``tolerance``, or below 1e-8 if a factorisation is needed."""
         if self._known and (solution := self._iterated(data, right, tolerance)) is not None:
             return solution
         if self._factors.rough:
@@ -211,13 +212,13 @@ class Solver:
         self._factors = self._new(rough=rough)
 
     def _factorise(self, data: FloatArray) -> None:
-        self._known = False  # the old one is gone even if this fails
+        self._known = False  # the old factors are gone even if this fails
         self._factors.factorise(data)
         self._known = True
         self.factorisations += 1
 
     def forget(self) -> None:
-        """Factorise at the next solution in any case, so that it does not depend on earlier ones."""
+        """Factorise at the next solution, so that it does not depend on earlier ones."""
         self._known = False
         if self._began_rough and not self._factors.rough:
             self._renew(rough=True)
@@ -247,7 +248,7 @@ class Solver:
             left = float(np.linalg.norm(residual)) / first
             if left <= tolerance:
                 return x
-            # At this rate, would it get there?
+            # Would it converge at this rate?
             if left >= 1.0 or step * np.log(tolerance) / np.log(left) > _MOST_STEPS:
                 return None
         return None

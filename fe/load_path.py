@@ -1,4 +1,4 @@
-"""A plate pressed against tissue, load after load, from one converged increment to the next."""
+"""Load paths: a plate pressed against tissue in a sequence of loads and converged increments."""
 
 import time
 from collections.abc import Callable
@@ -21,31 +21,31 @@ from fe.problem import PlateTarget, Problem
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
-_TIPPING = 0.5  # of a level plate's indentation: one that is released sinks in further
+_TIPPING = 0.5  # fraction of the parallel plate's indentation: a released plate above it has tipped over
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
 _LEAST_APPROACH_MM = 0.01
 _ALONG_NORMAL = np.array([True, False, False])
-_ENOUGH = (0.2, 0.4, 0.6, 0.8)  # shares of the normal load up to which the plate is moved, and not yet pushed
+_ENOUGH = (0.2, 0.4, 0.6, 0.8)  # fractions of the normal load up to which the plate is displacement controlled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateState:
-    """A plate in equilibrium; vectors along its axes at the start.
+    """State of a plate in equilibrium; vectors along its axes at the start.
 
     Attributes
     ----------
     displacement_mm : (3,)
-        Of its pivot, from its start.
+        Of the pivot, from its start.
     force_n : (3,)
         On the tissue.
     turn_deg : (3,)
-        Axis of its rotation times the angle.
+        Rotation vector: axis times angle.
     moment_nmm : (3,)
-        On the tissue, about its pivot.
+        On the tissue, about the pivot.
     area_mm2 : float
-        Of the deformed surface on it: of faces with all their corners on the plate.
+        Deformed contact area: that of faces with all corners on the plate.
     """
 
     displacement_mm: FloatArray
@@ -56,7 +56,7 @@ class PlateState:
 
     @property
     def pressure_mpa(self) -> float:
-        """Mean contact pressure: normal force over area; NaN where no whole face holds."""
+        """Mean contact pressure: normal force over area; NaN if no whole face is in contact."""
         return float(self.force_n[0]) / self.area_mm2 if self.area_mm2 > 0.0 else float("nan")
 
 
@@ -64,10 +64,10 @@ _Increment = tuple[FloatArray, PlateState, ContactStatus]  # a converged one, wi
 
 
 class LoadPath:
-    """The body under a growing load, increment by increment; vectors along the plate's axes, ``mesh`` too.
+    """The body under an increasing load, increment by increment; vectors and ``mesh`` are along the plate's axes.
 
-    ``curve`` is the plate at every converged increment so far. ``log`` gets a line for each step, ``is_over`` says
-    whether to stop, ``on_converged`` is called at each increment that can be resumed from.
+    ``curve`` is the state of the plate at every converged increment so far. ``log`` is called with a line for each
+    step, ``is_over`` returns whether to stop, and ``on_converged`` is called at each increment that can be resumed.
     """
 
     def __init__(
@@ -90,14 +90,14 @@ class LoadPath:
         self.iterations = 0
 
     def reached(self, target: PlateTarget) -> FloatArray:
-        """What is reached (3,) of the quantities that a target prescribes."""
+        """Current values (3,) of the quantities that a target prescribes."""
         return np.where(target.displaced, self.plate.displacement_mm, self.plate.force_n)
 
     def approach(self, target: PlateTarget) -> bool:
-        """Touch, press on to a part of the normal load, release a plate that turns; whether going on makes sense."""
+        """Make contact, press to a fraction of the normal load, and release a rotating plate; whether to continue."""
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
-        for share in _ENOUGH:  # on a node or two it would tip over: level until released, at a larger share if need be
+        for share in _ENOUGH:  # on a node or two the plate would tip over: it stays parallel until more nodes touch
             if target.displaced[0]:
                 way = target.values - self._start_mm
                 part = PlateTarget(self._start_mm + share * way, target.displaced).unsheared()
@@ -112,7 +112,7 @@ class LoadPath:
         return False
 
     def _let_go(self) -> bool:
-        """Remove the moment that kept the plate level, under its force; False if it comes out, on too few nodes."""
+        """Remove the moment that kept the plate parallel, at constant force; False if the plate tips over."""
         level, force, moment = self.increment, self.plate.force_n, self.plate.moment_nmm
         self.contact.status = replace(self.contact.status, turns=True)
         gap_mm, left, step = self.contact.plate.gap_mm, 1.0, 0.5
@@ -131,9 +131,9 @@ class LoadPath:
         return left == 0.0
 
     def raise_to(self, target: PlateTarget) -> bool:
-        """Go on to the target, in steps as large as converge; whether it is reached."""
+        """Continue to the target, in steps as large as converge; whether it is reached."""
         before = self.reached(target)
-        way = target.values - before  # displaced in steps so small that nodes touch in their order
+        way = target.values - before  # displacement steps are small, so that nodes come into contact in order
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, _FIRST_STEP, False
         least = min(_LEAST_STEP, 0.01 * largest)
@@ -142,18 +142,18 @@ class LoadPath:
             share = min(1.0, done + step)
             if self._go(target.displaced, before + share * way, downhill=downhill):
                 done, step = share, step if downhill else step * _GROWTH
-                self._log(f"{done:.0%} of the way")
+                self._log(f"{done:.0%} of this stage")
                 self.on_converged()
                 continue
             step *= _SHRINK
             stays = self.contact.plate.taped and not self.contact.status.turns
-            # where Newton's method fails under forces, viscous descent takes over
+            # if Newton's method fails under force control, viscous descent takes over
             if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 
     def _push(self, enough_n: float, most_n: float) -> None:
-        """Move the plate along its normal until its force is enough, or no more can be had; never past the most."""
+        """Move the plate along its normal until its force is ``enough_n`` or cannot rise; never above ``most_n``."""
         farthest = self.plate.displacement_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
         step, growth = _APPROACH_MM, _GROWTH
         while self.plate.force_n[0] < enough_n and step > _LEAST_APPROACH_MM and not self.is_over():
@@ -172,10 +172,10 @@ class LoadPath:
     def _go(
         self, displaced: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0, *, downhill: bool = False
     ) -> bool:
-        """Find equilibrium at displacements (mm) along some of the plate's axes, and under forces (N) along the others.
+        """Find equilibrium with displacements (mm) along some of the plate's axes and forces (N) along the others.
 
-        A plate that turns freely also takes up a moment (3,), N mm. ``downhill`` is by `fe.descent`: under forces
-        alone, and a plate that does not turn. Where it fails, all is as it was.
+        A freely rotating plate also gets a moment (3,), N mm. ``downhill`` uses `fe.descent`, which needs forces along
+        all axes and a plate that does not rotate. If no equilibrium is found, the state is restored.
         """
         contact, before = self.contact, self.contact.status
         contact.begin(self.state)
@@ -187,7 +187,7 @@ class LoadPath:
         def changed(state: FloatArray, forces: FloatArray) -> bool:
             if touched := contact.update(state, forces):
                 self.assembler.share(contact.followers)
-            if downhill:  # what touches next does so from where it is now
+            if downhill:  # the next contacts start from the current state
                 contact.begin(state)
             return touched
 
@@ -201,7 +201,7 @@ class LoadPath:
             imposed = Imposed(outside, equations[displaced], (aim - self.plate.displacement_mm)[displaced])
             converged = equilibrium(*system, imposed, self.tolerance, changed, self.log, rotation)
         if converged and np.abs(contact.displacement_mm(converged.state) - self._start_mm).max() > self.extent_mm:
-            self.log("the plate would have moved farther than the body is large")
+            self.log("rejected: the plate would have moved by more than the size of the body")
             converged = None
         if converged is None:
             contact.status = before
@@ -209,7 +209,7 @@ class LoadPath:
         self.state = converged.state
         self.iterations += converged.iterations
         u = self.state[: 3 * len(self.model.space.nodes_mm)].reshape(-1, 3)
-        faces = self._faces[np.isin(self._faces, contact.held).all(axis=1)]  # with every corner on the plate
+        faces = self._faces[np.isin(self._faces, contact.held).all(axis=1)]  # all corners on the plate
         a, b, c = np.moveaxis((self.model.space.nodes_mm + u)[faces], 1, 0)
         area_mm2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
         self.plate = PlateState(
@@ -226,7 +226,7 @@ class LoadPath:
         return self.state, self.plate, self.contact.status
 
     def resume(self, where: _Increment) -> None:
-        """Go to an increment of this path, or of another on the same model; the curve stays as it is."""
+        """Go to an increment of this path, or of another path on the same model; the curve does not change."""
         self.state, self.plate, self.contact.status = where
 
     def _back(self, where: _Increment) -> None:
@@ -238,25 +238,25 @@ class LoadPath:
     def _log(self, what: str) -> None:
         at, nodes = self.plate, len(self.contact.held)
         moved, force, turn = (", ".join(f"{v:.3f}" for v in x) for x in (at.displacement_mm, at.force_n, at.turn_deg))
-        turned = f", turned {turn} degrees" if self.contact.status.turns else ""
+        turned = f", rotation {turn} degrees" if self.contact.status.turns else ""
         self.log(f"{what}: displacement {moved} mm, force {force} N, {nodes} nodes on the plate{turned}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
-    """What it takes to go on from the end of a load, or from a converged increment on the way to it.
+    """State from which a simulation continues: the end of a load, or a converged increment within it.
 
     Attributes
     ----------
     reached : float
-        Share of what the load adds to the one before it, all of it being 1: along the axis, of those that it changes,
-        where least is reached.
+        Fraction of the change from the previous load that is reached, 1 at the end of the load. If the load changes
+        several axes, that of the axis where it is smallest.
     stages : int
-        Stages of the load that are done; for the first of a path the approach is one.
+        Completed stages of the load; for the first load of a path, the approach of the plate is one.
     curve : tuple of PlateState
-        The plate at every converged increment from that of the load before it to this one.
+        State of the plate at every converged increment, from that of the previous load to this one.
     iterations : int
-        Newton steps since the load before it, those of increments that failed not counted.
+        Newton iterations since the previous load, without those of failed increments.
     unknowns : (unknowns,)
         Displacements, along the plate's axes, and pressures.
     """
@@ -271,10 +271,11 @@ class Checkpoint:
 
 
 class Loading:
-    """A load in progress on a path that is where the load before it ended.
+    """A load in progress, which starts from the end of the previous load of its path.
 
-    ``before`` is that load's target, None for the first, which has to touch; ``earlier`` is where this load came to in
-    an earlier solution. ``on_converged`` gets a checkpoint and the share that is done, at each converged increment.
+    ``before`` is the target of the previous load, None for the first load, which starts with the approach. ``earlier``
+    is the checkpoint of this load in an earlier solution. ``on_converged`` is called at each converged increment with a
+    checkpoint and the fraction done.
     """
 
     def __init__(
@@ -283,11 +284,11 @@ class Loading:
     ) -> None:  # fmt: skip
         self._path, self._target, self._first = path, target, before is None
         self._before = path.reached(target)
-        if before is not None:  # what was asked for, not what was reached to the tolerance
+        if before is not None:  # the target itself, not the values reached within the tolerance
             self._before = np.where(target.displaced == before.displaced, before.values, self._before)
         self._began, self._counted = time.monotonic() - (earlier.seconds if earlier else 0.0), path.iterations
         self._stages, self._complete = 0, False
-        path.solver.forget()  # so that a load depends on where it begins, and not on what was solved before
+        path.solver.forget()  # so that a load depends only on its start, not on earlier solutions
         path.assembler.forget()
         path.curve = path.curve[-1:]
         if earlier is not None:
@@ -297,7 +298,7 @@ class Loading:
         path.on_converged = lambda: on_converged(self.checkpoint(), float(np.clip(self._shares(), 0.0, 1.0).mean()))
 
     def run(self) -> bool:
-        """Go to the target, normal first and then shear; whether it is reached."""
+        """Load up to the target, normal first, then shear; whether it is reached."""
         path, target = self._path, self._target
         goals = [target.unsheared(), target] if self._first and target.sheared else [target]
         stages = [partial(path.raise_to, goal) for goal in goals]
@@ -311,7 +312,7 @@ class Loading:
         return True
 
     def checkpoint(self) -> Checkpoint:
-        """Where it is now."""
+        """Checkpoint of the current state."""
         path = self._path
         reached = 1.0 if self._complete else max(0.0, float(self._shares().min(initial=1.0)))
         return Checkpoint(
@@ -320,7 +321,7 @@ class Loading:
         )  # fmt: skip
 
     def _shares(self) -> FloatArray:
-        """Share reached of what the load adds, along each of the plate's axes where it adds something."""
+        """Fraction reached of the load's change, along each of the plate's axes that it changes."""
         way = self._target.values - self._before
         adds = way != 0.0
         if not adds.any():

@@ -1,10 +1,11 @@
-"""Material laws of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
+"""Constitutive models of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
 
-Every material law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F; its bulk modulus comes from the initial
+Every model is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F. The bulk modulus is computed from the initial
 shear modulus mu0 and Poisson's ratio, K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)). Units: MPa; stretches have none.
 
-What a number means depends on the program that it was made for; the constructors say which: `Ogden.from_ansys`,
-`Ogden.from_abaqus`, `Ogden.from_febio`. The same mu and alpha give initial shear moduli that differ by alpha / 2.
+Programs define the Ogden parameters differently, so there is a constructor for each convention: `Ogden.from_ansys`,
+`Ogden.from_abaqus`, `Ogden.from_febio`. In ANSYS and Abaqus, for example, the same mu and alpha give initial shear
+moduli that differ by the factor alpha / 2.
 """
 
 from collections.abc import Mapping
@@ -19,26 +20,27 @@ from dvc.errors import InputError
 from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL, along, least_stiffness, stress_and_tangent
 
 HIGHEST_NU = 0.49999
-"""Above it the bulk modulus is over 50,000 times the shear modulus: measurements cannot tell it from infinite."""
+"""Largest Poisson's ratio. Above it, the bulk modulus is over 50,000 times the shear modulus, and a measurement cannot
+distinguish the material from an incompressible one."""
 
 MODES: Mapping[str, tuple[float, float, float]] = {
     "uniaxial": (1.0, -0.5, -0.5),
     "equibiaxial": (1.0, 1.0, -2.0),
     "pure shear": (1.0, 0.0, -1.0),
 }
-"""Logarithmic stretches of an incompressible test over that of its axis of loading."""
+"""Logarithmic stretches of an incompressible test, relative to that of the loading axis."""
 
 _SEARCHED = float(np.log(5.0))  # stretches of 1/5 to 5 are searched for a loss of stability
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Material:
-    """A material law (hyperelastic) with its parameters; made by `NeoHooke`, `Yeoh`, `Ogden` and `Hencky`.
+    """A hyperelastic constitutive model with its parameters; made by `NeoHooke`, `Yeoh`, `Ogden` and `Hencky`.
 
     Attributes
     ----------
     vector : (4 + 2 n,)
-        As `fe.hyperelastic` takes it: C10, C20, C30, mu_H, then pairs mu_q (initial shear modulus), alpha_q; MPa.
+        As in `fe.hyperelastic`: C10, C20, C30, mu_H, then pairs mu_q (initial shear modulus), alpha_q; MPa.
     nu : float
         Poisson's ratio at small strain.
 
@@ -52,17 +54,17 @@ class Material:
     vector: FloatArray
     nu: float
     law: ClassVar[str] = "hyperelastic"
-    named: ClassVar[Mapping[str, tuple[int, float]]] = {}  # numbers by their names: places in the vector, and factors
+    named: ClassVar[Mapping[str, tuple[int, float]]] = {}  # parameters by name: position in the vector, and factor
 
     def __post_init__(self) -> None:
         vector = frozen(self.vector, np.float64)
         object.__setattr__(self, "vector", vector)
         if not (np.isfinite(vector).all() and np.isfinite(self.nu)):
-            raise InputError(f"{self.description}: every parameter of a material law must be finite.")
+            raise InputError(f"{self.description}: all parameters must be finite.")
         if not 0.0 <= self.nu <= HIGHEST_NU:
             raise InputError(
-                f"{self.description}: Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {self.nu:g}. For "
-                "incompressible tissue give 0.4999."
+                f"{self.description}: Poisson's ratio must be between 0 and {HIGHEST_NU}; got {self.nu:g}. For "
+                "incompressible tissue use 0.4999."
             )
         if not self.shear_modulus_mpa > 0.0:
             raise InputError(
@@ -70,16 +72,16 @@ class Material:
             )
 
         if not (np.abs(vector[OGDEN + 1 :: 2]) > 1e-6).all():
-            raise InputError("Ogden: an exponent of 0 has no meaning; Hencky's law is the limit.")
+            raise InputError("Ogden: an exponent of 0 is not allowed; its limit is the Hencky model.")
 
     @property
     def moduli_mpa(self) -> dict[str, float]:
-        """The numbers by which the law is known, by name, MPa; those of Ogden's terms stand in `vector`."""
+        """Parameters by name, MPa; those of Ogden terms are only in `vector`."""
         return {name: factor * float(self.vector[place]) for name, (place, factor) in self.named.items()}
 
     @property
     def description(self) -> str:
-        """Model and parameters, in words."""
+        """Model and parameters, as text."""
         terms = self.vector[OGDEN:].reshape(-1, 2)
         numbers = [f"{name} {_kpa(value)}" for name, value in self.moduli_mpa.items()]
         numbers += ["; ".join(f"mu0 {_kpa(mu)}, alpha {alpha:g}" for mu, alpha in terms)] if len(terms) else []
@@ -110,7 +112,7 @@ class Material:
     def _response(self, F: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         gradients = np.ascontiguousarray(F, dtype=np.float64)
         if gradients.ndim != 3 or gradients.shape[1:] != (3, 3):
-            raise InputError(f"Deformation gradients have shape (n, 3, 3); got {gradients.shape}.")
+            raise InputError(f"Deformation gradients must have shape (n, 3, 3); got {gradients.shape}.")
         n = len(gradients)
         response = np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3, 3, 3, 3))
         stress_and_tangent(self.vector, self.bulk_modulus_mpa, gradients, *response)
@@ -119,7 +121,8 @@ class Material:
     def nominal_stress(self, stretch: npt.ArrayLike, mode: str = "uniaxial") -> FloatArray:
         """Force over undeformed area (n,), MPa, of the incompressible solid at stretches (n,) of a test in `MODES`.
 
-        In an equibiaxial test, that of one of the two axes. The true (Cauchy) stress is stretch times this.
+        For an equibiaxial test, it is the stress of one of the two axes. The true (Cauchy) stress is the stretch times
+        the nominal stress.
 
         Examples
         --------
@@ -129,7 +132,7 @@ class Material:
         return nominal_stress(self.vector, np.asarray(stretch, dtype=np.float64), mode)
 
     def is_stable(self, F: npt.ArrayLike) -> BoolArray:
-        """Whether Drucker's condition holds at F (n, 3, 3), volume kept: d tau : d(ln V) > 0 for every small change.
+        """Whether Drucker's condition holds at F (n, 3, 3): d tau : d(ln V) > 0 for every small isochoric change.
 
         tau is the Kirchhoff stress; False where det F <= 0.
         """
@@ -139,7 +142,7 @@ class Material:
         return np.asarray(~folded & (least_stiffness(self.vector, strains) > 0.0))
 
     def stable_range(self, mode: str) -> tuple[float, float]:
-        """Least and greatest stretch of a test, between 1/5 and 5, between which the material law is stable (Drucker).
+        """Smallest and largest stretch of a test, within 1/5 to 5, between which the model is stable (Drucker).
 
         Examples
         --------
@@ -159,7 +162,7 @@ Materials = Mapping[str, Material]
 
 
 def nominal_stress(vector: FloatArray, stretch: FloatArray, mode: str) -> FloatArray:
-    """As `Material.nominal_stress`, for a material law's vector alone."""
+    """As `Material.nominal_stress`, from a parameter vector."""
     axes = _axes(mode)
     if not (stretch > 0.0).all():
         raise InputError("Stretches must be positive.")
@@ -169,7 +172,7 @@ def nominal_stress(vector: FloatArray, stretch: FloatArray, mode: str) -> FloatA
 
 def _axes(mode: str) -> FloatArray:
     if mode not in MODES:
-        raise InputError(f"No test '{mode}'; there are {', '.join(MODES)}.")
+        raise InputError(f"Unknown test '{mode}'; available are {', '.join(MODES)}.")
     return np.array(MODES[mode])
 
 
@@ -180,7 +183,7 @@ def _kpa(value_mpa: float) -> str:
 def _terms(mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     moduli, exponents = frozen(np.atleast_1d(mu_mpa), np.float64), frozen(np.atleast_1d(alpha), np.float64)
     if moduli.shape != exponents.shape or moduli.ndim != 1 or not len(moduli):
-        raise InputError(f"Ogden: {moduli.size} moduli and {exponents.size} exponents; as many of each are needed.")
+        raise InputError(f"Ogden: {moduli.size} moduli and {exponents.size} exponents; their numbers must be equal.")
     return moduli, exponents
 
 
@@ -199,7 +202,7 @@ class NeoHooke(Material):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Yeoh(Material):
-    """Wbar = C10 (I1bar - 3) + C20 (I1bar - 3)^2 + C30 (I1bar - 3)^3; without C30 also called Isihara's.
+    """Wbar = C10 (I1bar - 3) + C20 (I1bar - 3)^2 + C30 (I1bar - 3)^3; without C30 also called the Isihara model.
 
     C10 is half the initial shear modulus, I1bar the first invariant of the isochoric F^T F.
     """
@@ -217,8 +220,8 @@ class Yeoh(Material):
 class Hencky(Material):
     """Wbar = mu sum_i ebar_i^2: linear elastic in logarithmic strain.
 
-    It is what a linear elastic material amounts to under large displacements; Saint Venant-Kirchhoff's law, which is
-    linear in the Green-Lagrange strain, collapses in compression.
+    It extends linear elasticity to large deformation. The Saint Venant-Kirchhoff model, which is linear in the
+    Green-Lagrange strain, collapses in compression.
     """
 
     law: ClassVar[str] = "linear elastic (Hencky)"
@@ -234,8 +237,8 @@ class Hencky(Material):
 class Ogden(Material):
     """Wbar = sum_q 2 mu_q / alpha_q^2 (l_1^alpha_q + l_2^alpha_q + l_3^alpha_q - 3), l the isochoric stretches.
 
-    mu_q is what the term adds to the initial shear modulus. Programs print other numbers: use the constructor of the
-    program that yours are from.
+    mu_q is the contribution of the term to the initial shear modulus. Programs define their parameters differently: use
+    the constructor of the program from which your parameters come.
 
     Examples
     --------
@@ -270,7 +273,7 @@ class Ogden(Material):
 
     @classmethod
     def from_abaqus(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
-        """W = sum 2 mu / alpha^2 (sum l^alpha - 3), so mu0 = mu; CalculiX writes it so as well."""
+        """W = sum 2 mu / alpha^2 (sum l^alpha - 3), so mu0 = mu; also the convention of CalculiX."""
         return cls.of(mu_mpa, alpha, nu)
 
     @classmethod
@@ -280,7 +283,7 @@ class Ogden(Material):
 
 
 def from_vector(description: str, vector_mpa: FloatArray, bulk_modulus_mpa: float) -> Material:
-    """A material from its description and numbers; Poisson's ratio, to ten digits, from the bulk modulus."""
+    """A material from its description and parameters; Poisson's ratio, to ten digits, from the bulk modulus."""
     (made,) = (one for one in (NeoHooke, Yeoh, Hencky, Ogden) if description.startswith(f"{one.law},"))
     mu, K = Material(vector_mpa, 0.0).shear_modulus_mpa, bulk_modulus_mpa
     return made(vector_mpa, round((3.0 * K - 2.0 * mu) / (6.0 * K + 2.0 * mu), 10))

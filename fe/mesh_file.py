@@ -1,4 +1,4 @@
-"""Meshes made here, kept as files that ParaView opens and that are read back with every name; names of surfaces."""
+"""Mesh files with the names of regions and surface sets, readable by ParaView; names of the standard surface sets."""
 
 import json
 import re
@@ -16,10 +16,11 @@ from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
 
 BONE, SKIN, CUT = "bone", "skin", "cut"
-"""The interface with bone, which is fixed; the outer surface, which the plate may touch; and where a label map ends."""
+"""Surface sets: the interface with bone, which is fixed; the outer surface, which the plate may touch; and the
+truncation surface, where the label map ends."""
 
-_FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1
-_MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
+_FIRST_FACET = 101  # first number of the surface sets in the array "region"; those of tissues begin at 1
+_MATERIAL = re.compile(r"material \d+")  # ANSYS also groups cells by material, in addition to components
 
 
 @checked
@@ -27,15 +28,15 @@ def write_tet_mesh(
     path: Path | str, mesh: TetMesh, about: Mapping[str, object] = MappingProxyType({}),
     at_nodes: Mapping[str, FloatArray] | None = None,
 ) -> None:  # fmt: skip
-    """Write a mesh as VTU, LPS mm, with the names of its regions and facets in a JSON file beside it.
+    """Write a mesh as VTU, LPS mm, and the names of its regions and surface sets in a JSON file next to it.
 
     Parameters
     ----------
     path : path
-        Ending in .vtu: tetrahedra, and the triangles of the facets, numbered in the array ``region``. The JSON file has
-        the same name; `read_tet_mesh` reads both.
+        Ending in .vtu: tetrahedra, and the triangles of the surface sets, numbered in the array ``region``. The JSON
+        file has the same name; `read_tet_mesh` reads both.
     about : mapping
-        What else is to stand in the JSON file, such as how the mesh was made.
+        Further content of the JSON file, such as how the mesh was made.
     at_nodes : mapping of name to (n,) or (n, k) float, optional
         Point data, for ParaView.
 
@@ -46,7 +47,7 @@ def write_tet_mesh(
     """
     place = Path(path)
     if place.suffix.lower() != ".vtu":
-        raise InputError(f"{place}: a mesh is written as VTU; let its name end in .vtu.")
+        raise InputError(f"{place}: meshes are written as VTU; the file name must end in .vtu.")
     blocks, numbers = [("tetra", mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)]
     for number, cells in enumerate(mesh.regions.values(), start=1):
         numbers[0][cells] = number
@@ -60,22 +61,22 @@ def write_tet_mesh(
 
 
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
-    """Read a mesh of tetrahedra with its named regions and facets, made here or elsewhere.
+    """Read a tetrahedral mesh with its named regions and surface sets, made by mrstrain or another program.
 
-    A JSON file of the same name may give the names of the numbers in the array ``region``. A set of all cells is left
-    out where others divide them, and so are the materials of ANSYS where components do. The facets "bone", "skin" and
-    "cut" are recognised in any case: ANSYS has capitals only.
+    A JSON file of the same name may name the numbers in the array ``region``. A set of all cells is ignored if other
+    sets contain every cell, and so are the materials of ANSYS if its components do. The surface sets "bone", "skin" and
+    "cut" are recognised in upper or lower case (ANSYS writes capitals only).
 
     Raises
     ------
     InputError
-        If it cannot be used: as `dvc.io.meshes.read.read_mesh`, for elements other than tetrahedra, or if two facets
-        have one name but for its case.
+        As `dvc.io.meshes.read.read_mesh`; also for elements other than tetrahedra, or if the names of two surface sets
+        differ only in case.
     """
     place = Path(path)
     read = read_mesh(place, unit=unit, frame=frame)
     if read.tets is None:
-        raise InputError(f"{place}: the simulation takes tetrahedra; this mesh has cells of other shapes.")
+        raise InputError(f"{place}: simulations need tetrahedra, and this mesh has cells of other shapes.")
     names: dict[str, str] = {}
     names_file = place.with_suffix(".json")
     if names_file.is_file():
@@ -83,7 +84,7 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
             table = json.loads(names_file.read_text(encoding="utf-8"))["regions"]
             names = {f"region {number}": str(name) for number, name in table.items()}
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
-            raise InputError(f"{names_file}: no table of regions in it ({damaged}).") from damaged
+            raise InputError(f"{names_file}: the table of region names is missing or damaged ({damaged}).") from damaged
     mesh = read.tets
     regions, count = {names.get(name, name): cells for name, cells in mesh.regions.items()}, len(mesh.cells)
     regions = _without(regions, {name for name, cells in regions.items() if len(cells) == count}, count)
@@ -93,19 +94,19 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
         known = names.get(name, name)
         known = known.casefold() if known.casefold() in (BONE, SKIN, CUT) else known
         if known in facets:
-            raise InputError(f"{place}: two sets of facets are called '{known}'; case does not count. Rename one.")
+            raise InputError(f"{place}: two surface sets are named '{known}' (case is ignored); rename one.")
         facets[known] = rows
     return TetMesh(mesh.points_mm, mesh.cells, regions, facets, mesh.node_ids)
 
 
 def _without(regions: dict[str, IntArray], names: set[str], cell_count: int) -> dict[str, IntArray]:
-    """Regions but for some, if the others still hold every cell; if not, all of them."""
+    """The regions without ``names``, if the others contain every cell; otherwise all regions."""
     others = {name: cells for name, cells in regions.items() if name not in names}
     held = np.unique(np.concatenate([*others.values(), np.empty(0, dtype=np.int64)]))
     return others if len(held) == cell_count else regions
 
 
 def fixed_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:
-    """Names of the facets that do not move: the bone's and those ``beside`` it, as the mesh spells them."""
+    """Names of the fixed surface sets, as spelt in the mesh: "bone", and those in ``beside``."""
     spelt = {name.casefold(): name for name in mesh.facets} | {name: name for name in mesh.facets}
     return tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in beside)]))

@@ -1,4 +1,4 @@
-"""From a label map to a conforming mesh of linear tetrahedra, with named tissues and surfaces."""
+"""Conforming mesh of linear tetrahedra from a label map, with named tissues and surface sets."""
 
 import threading
 import time
@@ -18,16 +18,16 @@ from fe.mesh_file import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.tissue_surfaces import borders_of, labels_at, thinned, with_volumes
 
-_ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
-_THINNED = 0.05  # of the smallest voxel edge: sum of the errors where nodes are taken out of the borders
-_FARTHEST = 0.1  # of the smallest voxel edge: how far a node may move at once to keep the tissues' volumes
-_LONGER = 1.05  # on thinned surfaces fTetWild makes edges shorter than on whole ones: a tenth more cells
+_ENVELOPE = 0.2  # of the smallest voxel edge: largest distance of the mesh from the tissue surfaces
+_THINNED = 0.05  # of the smallest voxel edge: sum of the errors when nodes are removed from the surfaces
+_FARTHEST = 0.1  # of the smallest voxel edge: largest move of a node in one step towards the tissues' volumes
+_LONGER = 1.05  # fTetWild makes shorter edges on decimated surfaces: a tenth more cells
 _SURE = 0.8
 _SECONDS_PER_TRIANGLE, _SECONDS_PER_CELL = 5e-4, 3e-4  # as measured on one core
 _MOST_LOST = 0.2  # of a tissue's volume
-_ALIGNED = 0.8  # cosine between a face and the plane of a cut that it goes on in
-_RIM_VOXELS = 6.0  # how far the section of a skin may reach
-_REFINED_MM = 2.0  # spacing of the lattice that carries a finer edge length
+_ALIGNED = 0.8  # cosine between a face of the skin and the plane of a truncation surface that it continues
+_RIM_VOXELS = 6.0  # largest width of the truncated skin
+_REFINED_MM = 2.0  # spacing of the lattice on which a finer edge length is given
 
 _Lattice = tuple[FloatArray, IntArray, FloatArray]  # points, tetrahedra and the edge length at each point, mm
 
@@ -42,8 +42,8 @@ class MeshQuality:
         Of the dihedral angles.
     edge_mm : (5th percentile, median, 95th percentile)
     volumes_ml : tuple of (region, mesh, label map)
-    thin : tuple of (region, share)
-        For regions between two surfaces: share of their cells that reach from one to the other.
+    thin : tuple of (region, fraction)
+        For regions between two surfaces: fraction of their cells that extend from one to the other.
     """
 
     cells: int
@@ -58,7 +58,7 @@ class MeshQuality:
 def check_meshing(
     labels: LabelMap, edge_mm: float, bones: Sequence[str], finer: tuple[str, float] | None
 ) -> dict[str, int]:
-    """Refuse what `mesh_labels` would, before it begins; return the numbers of the regions that the label map has.
+    """Check the arguments of `mesh_labels` before it starts; return the numbers of the label map's regions.
 
     Raises
     ------
@@ -68,17 +68,17 @@ def check_meshing(
     spacing = float(labels.grid.spacing_mm.min())
     if not 0.5 * spacing <= edge_mm <= 20.0:
         raise InputError(
-            f"The edge length must lie between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
+            f"The edge length must be between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm} mm."
         )
     if finer is not None and not 0.0 < finer[1] < edge_mm:
-        raise InputError(f"The finer edge length must lie between 0 and {edge_mm} mm; got {finer[1]}.")
+        raise InputError(f"The finer edge length must be between 0 and {edge_mm} mm; got {finer[1]} mm.")
     there = set(np.unique(labels.labels).tolist())
     numbers = {name: number for number, name in labels.names.items() if number in there}
     for name in (*bones, *((finer[0],) if finer else ())):
         if name not in numbers:
             raise labels.no_region(name)
     if not numbers.keys() - set(bones):
-        raise InputError(f"No soft tissue is left in the label map beside {', '.join(bones)}.")
+        raise InputError(f"The label map has no soft tissue to mesh, only bone ({', '.join(bones)}).")
     return numbers
 
 
@@ -92,22 +92,24 @@ def mesh_labels(
     Parameters
     ----------
     edge_mm : float
-        Length of edges wanted, mm. Thin tissues get shorter ones.
+        Target edge length, mm. Thin tissues get shorter edges.
     bones : sequence of str
         Regions that are cut out; their surface is named "bone".
     finer : (region, edge in mm), optional
-        Another edge length in a region and close to it: 1 mm in a skin of 2 mm makes it two cells thick.
+        Another edge length in and near one region: 1 mm in a skin of 2 mm makes it two cells thick.
     limit_s : float
-        Time after which meshing is given up.
+        Time after which meshing is stopped, s.
     watch : callable
-        Gets the share that is done, about twice a second; the mesher reports none, so it is estimated from the sizes.
+        Called about twice a second with the fraction done. It is estimated from the sizes, because the mesher reports
+        no progress.
 
     Returns
     -------
     mesh : TetMesh
-        LPS mm, with a region for each soft tissue, and the facets "bone", "skin" (the outer surface) and "cut" (where
-        the label map ends: outer faces of other tissues than skin, and the skin's own edge there). Without a region
-        called skin, in whatever case, there is no "cut", and all of them are "skin".
+        LPS mm, with a region for each soft tissue, and the surface sets "bone", "skin" (the outer surface) and "cut"
+        (the truncation surface, where the label map ends: outer faces of tissues other than skin, and the cross section
+        of the skin there). Without a region named skin (in any case), there is no "cut", and all outer faces are
+        "skin".
     quality : MeshQuality
 
     Raises
@@ -115,15 +117,15 @@ def mesh_labels(
     InputError
         As from `check_meshing`.
     MrstrainError
-        If a tissue vanished or lost a fifth of its volume, or meshing took too long.
+        If a tissue is missing in the mesh or lost a fifth of its volume, or if meshing took too long.
 
     Notes
     -----
-    Borders are thinned where they are flat (`fe.tissue_surfaces.thinned`). The tetrahedra are fTetWild's (Hu and others
-    2020, doi:10.1145/3386569.3392385), within a fifth of a voxel of these borders. Borders are then moved, by three
-    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.tissue_surfaces`); where a cell
-    has an angle under 12 degrees, nodes are moved until there is none or no move helps. Meshes differ slightly from run
-    to run: keep a mesh, and its hash, with what was computed on it.
+    Tissue surfaces are decimated where they are flat (`fe.tissue_surfaces.thinned`). The tetrahedra are made by
+    fTetWild (Hu and others 2020, doi:10.1145/3386569.3392385), within a fifth of a voxel of these surfaces. The
+    surfaces are then moved by at most three tenths of a voxel until each region has the volume of its voxels
+    (`fe.tissue_surfaces`). Nodes of cells with dihedral angles under 12 degrees are moved until there are none or no
+    move helps. Meshes differ slightly from run to run: keep the mesh, and its hash, with the results computed on it.
     """
     numbers = check_meshing(labels, edge_mm, bones, finer)
     soft = {name: number for name, number in numbers.items() if name not in bones}
@@ -144,33 +146,33 @@ def mesh_labels(
 
 
 def self_test() -> str:
-    """Mesh a small ball around a bone; return a sentence on what came out, for `mrstrain doctor`."""
+    """Mesh a small ball around a bone; return a sentence with the result, for `mrstrain doctor`."""
     grid = Grid((12, 12, 12), np.ones(3), np.full(3, -5.5))
     radius = np.linalg.norm(grid.points(), axis=-1)
     labels = LabelMap(grid, (radius < 5.0) + (radius < 2.5).astype(np.int64), {1: "fat", 2: "bone"})
     _, quality = mesh_labels(labels, 2.0, limit_s=60.0)
-    return f"a ball became {quality.cells} cells"
+    return f"meshed a ball with {quality.cells} cells"
 
 
 def _refuse_lost(
     numbers: dict[str, int], volumes_mm3: dict[int, float], of_cells: FloatArray, cell_labels: IntArray
 ) -> None:
-    """Refuse a mesh in which a region, bones included, is gone or lost a fifth of what its voxels hold."""
-    instead = "Ask for shorter edges, or give its label to a neighbour."
+    """MrstrainError if a region, bones included, is missing in the mesh or lost a fifth of its volume."""
+    instead = "Use a shorter edge length, or merge its label with a neighbouring tissue."
     lost = [name for name, number in numbers.items() if not (cell_labels == number).any()]
     if lost:
-        raise MrstrainError(f"No cell is left of {', '.join(lost)}: smaller than the mesh can show. {instead}")
+        raise MrstrainError(f"The mesh has no cell of {', '.join(lost)}, which is too small for it. {instead}")
     for name, number in numbers.items():
         made, given = float(of_cells[cell_labels == number].sum()) / 1000.0, volumes_mm3[number] / 1000.0
         if abs(made - given) > _MOST_LOST * given:
             raise MrstrainError(
-                f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh "
-                f"or the voxels show. {instead}"
+                f"{name} has {made:.2f} mL in the mesh but {given:.2f} mL in the label map: it is too thin for the "
+                f"mesh or for the voxels. {instead}"
             )
 
 
 def _guessed(share: float) -> float:
-    """What is done after a share of the expected time; from then on about a sixth of that time is left."""
+    """Fraction done after a fraction of the expected time; beyond it, it approaches 1 slowly."""
     return share if share < _SURE else 1.0 - (1.0 - _SURE) * _SURE / share
 
 
@@ -178,7 +180,7 @@ def _limited(
     surface: tuple[FloatArray, IntArray], edge_mm: float, envelope_mm: float, lattice: _Lattice | None, limit_s: float,
     watch: Callable[[float], None],
 ) -> tuple[FloatArray, IntArray]:  # fmt: skip
-    """Tetrahedra of the whole box, made in a process of its own that ends at the time limit."""
+    """Tetrahedra of the whole box, made in a separate process that is ended at the time limit."""
     began = time.monotonic()
     points_mm, triangles = surface
     box_mm3 = float(np.prod(np.ptp(points_mm, axis=0)))
@@ -194,8 +196,8 @@ def _limited(
     except WorkerError as ended:
         if time.monotonic() - began >= limit_s:
             raise MrstrainError(
-                f"Meshing was given up after {limit_s:.0f} s. Ask for longer edges, mend the label map (specks and "
-                "holes of a few voxels cost most), or allow more time."
+                f"Meshing was stopped at its time limit of {limit_s:.0f} s. Use a longer edge length, remove specks "
+                "and holes of a few voxels from the label map (they take most time), or raise the limit."
             ) from ended
         raise
     finally:
@@ -219,7 +221,7 @@ def _tetrahedra(
 
 
 def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> _Lattice:
-    """Edge lengths on a lattice of tetrahedra: ``finer_mm`` in a region, rising to ``edge_mm`` away from it."""
+    """Edge lengths on a lattice of tetrahedra: ``finer_mm`` in a region, increasing to ``edge_mm`` away from it."""
     from scipy.ndimage import distance_transform_edt
 
     grid = labels.grid
@@ -264,7 +266,7 @@ def _named(
 
 
 def _rim(points: FloatArray, triangles: IntArray, asked: BoolArray, cut: BoolArray, labels: LabelMap) -> BoolArray:
-    """Faces of the skin that go on in the plane of a cut: the skin's own section."""
+    """Faces of the skin that continue the plane of a truncation surface: the cross section of the skin."""
     if not cut.any() or not asked.any():
         return np.zeros(len(triangles), dtype=bool)
     corners = points[triangles]
@@ -275,7 +277,7 @@ def _rim(points: FloatArray, triangles: IntArray, asked: BoolArray, cut: BoolArr
     rim = np.zeros(len(triangles), dtype=bool)
     tree, planes = cKDTree(centre[cut]), normal[cut]
     _, nearest = tree.query(centre[asked], k=min(8, len(planes)))
-    # The section's plane: the mean of the nearest faces of the cut, whichever way round they are.
+    # Plane of the section: the mean of the nearest faces of the truncation surface, whatever their orientation.
     nearest = nearest.reshape(int(asked.sum()), -1)
     around = planes[nearest]
     around *= np.sign(np.einsum("fki,fi->fk", around, around[:, 0]))[..., None]

@@ -1,4 +1,4 @@
-"""Newton's method for one increment of load, in steps that keep every cell from folding."""
+"""Newton's method for one load increment, with step lengths at which no cell folds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,30 +11,30 @@ from fe.linear import SingularError, Solver
 from fe.plate import Parallel
 
 _LEAST_SHARE = 1.0 / 256.0
-_NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
-LEAST_VOLUME = 0.002  # no step brings det F at a quadrature point below this: from there folding is near
+_NEAR = 0.02  # residual, as a fraction of the support forces, below which contact is updated
+LEAST_VOLUME = 0.002  # lower bound on det F at the quadrature points in any step: below it a cell is about to fold
 _MOST_GROWTH = 3.0  # of the residual in one step
-# Steps in a row that hardly lowered the residual: from the first number on several lengths are tried, at the second
-# the search ends.
+# Consecutive steps that hardly lowered the residual: from the first number on, several step lengths are tried; at the
+# second the search stops.
 _WANDERED, _LOST = 2, 12
-BALANCED, SMALL_MM = 5, 0.1  # so many steps in a row that end in balance, the last below this, count as converged
+BALANCED, SMALL_MM = 5, 0.1  # also converged: so many consecutive steps within the force tolerance, the last this small
 _SHARES = (1.0, 0.5, 0.25)
-_ROUGH, _INEXACT = 0.05, 1e-3  # residual of a linear solution that is not exact, far from equilibrium and near it
+_ROUGH, _INEXACT = 0.05, 1e-3  # tolerance of the linear solver, far from equilibrium and near it
 
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """When a state counts as in equilibrium.
+    """Convergence criterion of an increment.
 
     Attributes
     ----------
     force : float
-        Largest norm of the forces out of balance, as a share of the forces on the plate and fixed nodes.
+        Largest norm of the residual forces, as a fraction of the forces on the plate and the fixed nodes.
     step_mm : float
-        Largest change of a displacement in the last step, mm. Five steps in a row that end within ``force``, the
-        last below 0.1 mm, do as well: a cell that is nearly flat may have a way to move that costs no force.
+        Largest change of a displacement in the last step, mm. Five consecutive steps within ``force``, the last below
+        0.1 mm, are also accepted, because the nodes of a nearly flat cell may move almost without force.
     iterations : int
-        Steps before giving up.
+        Largest number of iterations.
     """
 
     force: float = 1e-4
@@ -53,11 +53,11 @@ class Converged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imposed:
-    """What an increment imposes from outside."""
+    """External forces and prescribed displacements of an increment."""
 
     forces_n: FloatArray  # (equations,) external forces
     prescribed: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # (h,) equations
-    moves_mm: FloatArray = field(default_factory=lambda: np.empty(0))  # (h,) of their unknowns, from the first guess
+    moves_mm: FloatArray = field(default_factory=lambda: np.empty(0))  # (h,) prescribed changes from the first guess
 
 
 def equilibrium(
@@ -67,9 +67,10 @@ def equilibrium(
 ) -> Converged | None:  # fmt: skip
     """Find the state in which internal forces balance the external ones, from a first guess (unknowns,).
 
-    ``changed(state, forces)`` is called once a state is near equilibrium, and again there: whether what the unknowns
-    follow has changed, as where more of a surface touches; it may move the state to where that is so. Without
-    ``rotation`` the plate stays parallel. None if it does not converge; where only forces are given, `fe.descent` may.
+    ``changed(state, forces)`` is called near equilibrium and again at equilibrium. It returns whether the constraints
+    of the unknowns have changed, for example because more of a surface touches the plate, and may adapt the state to
+    them. Without ``rotation`` the plate stays parallel. None if the iteration does not converge; if only forces are
+    prescribed, `fe.descent` may still converge.
     """
     newton = _Newton(assembler, solver, imposed, rotation or Parallel())
     displacements = 3 * len(assembler.model.space.nodes_mm)
@@ -92,7 +93,7 @@ def equilibrium(
         balance = now.unbalanced_n / max(reaction(assembler, now.forces), 1e-9)
         slow = now.unbalanced_n > 0.5 * before.unbalanced_n and balance > tolerance.force
         wandering = wandering + 1 if slow else 0
-        log(f"    {iteration}: out of balance {balance:.1e}, step {largest:.1e} mm, least det F {now.lowest:.3f}")
+        log(f"    {iteration}: residual {balance:.1e}, step {largest:.1e} mm, smallest det F {now.lowest:.3f}")
         if wandering >= _LOST:
             return None
         if left.any() or balance > _NEAR:
@@ -104,14 +105,14 @@ def equilibrium(
         if balanced and share == 1.0 and largest <= tolerance.step_mm:
             return Converged(now.state, now.forces, iteration)
         if balanced >= BALANCED and largest <= SMALL_MM:
-            log(f"    accepted: {balanced} steps in a row ended in balance, the last of {largest:.1e} mm")
+            log(f"    accepted: {balanced} consecutive steps within the force tolerance, the last of {largest:.1e} mm")
             return Converged(now.state, now.forces, iteration)
     return None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Iterate:
-    """A state on the way to equilibrium: its forces by unknown and by equation, least det F, and imbalance."""
+    """An iterate: the state, its forces by unknown and by equation, the smallest det F, and the residual norm."""
 
     state: FloatArray
     forces: FloatArray
@@ -122,7 +123,7 @@ class _Iterate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Newton:
-    """Steps of Newton's method for one increment: the change of all unknowns, and the plate's turn (3,)."""
+    """Newton steps of one increment: the change of all unknowns, and the rotation of the plate (3,)."""
 
     assembler: Assembler
     solver: Solver
@@ -136,30 +137,30 @@ class _Newton:
         return _Iterate(state, forces, residual, lowest, float(np.hypot(of_forces, of_moment)))
 
     def step(self, now: _Iterate, left_mm: FloatArray, accuracy: float) -> tuple[FloatArray, FloatArray]:
-        """The step from an iterate, with ``left_mm`` (h,) of the prescribed moves still to be made."""
+        """The step from an iterate; ``left_mm`` (h,) is the rest of the prescribed changes."""
         held = self.imposed.prescribed
         right = self.imposed.forces_n - now.residual
         right[self.assembler.idle] = 0.0
         data = self.assembler.held(self.assembler.tangent(now.state), right, held, left_mm)
         level = self.solver.solve(data, right, accuracy)
         solved, turn = self.rotation.solved(now.state, now.forces, data, level, held)
-        solved[held] = left_mm  # exactly, though the solution may be rough
+        solved[held] = left_mm  # exact even if the linear solution is approximate
         change = self.assembler.spread(solved)
         if not np.isfinite(change).all():
             raise SingularError("The linear solution is not finite.")
         return change, turn
 
     def ahead(self, now: _Iterate, step: tuple[FloatArray, FloatArray], share: float) -> _Iterate:
-        """The iterate after a share of a step."""
+        """The iterate after a fraction of a step."""
         change, turn = step
         return self.at(self.rotation.ahead(now.state, share * change, share * turn))
 
     def searched(
         self, now: _Iterate, step: tuple[FloatArray, FloatArray], bound_n: float, *, several: bool
     ) -> tuple[_Iterate, float]:
-        """The iterate after a step, halved until no cell folds and the bound holds, and its share; 0 if none does.
+        """The iterate after a step that is halved until no cell folds and the bound holds, and the fraction; 0 if none.
 
-        The first share is the whole step or, of ``several``, the one that leaves the least imbalance.
+        The first fraction is 1 or, with ``several``, the one of 1, 1/2 and 1/4 with the smallest residual.
         """
         share = 1.0
         if several:
@@ -174,7 +175,7 @@ class _Newton:
 
 
 def out_of_balance(unbalanced: FloatArray, assembler: Assembler, prescribed: IntArray | None = None) -> float:
-    """Norm of forces by equation (N), without those of unknowns that are prescribed."""
+    """Norm of the residual forces by equation (N), without those of prescribed unknowns."""
     balance = unbalanced.copy()
     balance[assembler.idle] = 0.0
     if prescribed is not None:
@@ -183,6 +184,6 @@ def out_of_balance(unbalanced: FloatArray, assembler: Assembler, prescribed: Int
 
 
 def reaction(assembler: Assembler, forces: FloatArray) -> float:
-    """Norm of the force that fixed nodes and shared equations carry, N."""
+    """Norm of the force on fixed nodes and shared equations, N."""
     carried = (assembler.equation < 0) | (assembler.equation >= assembler.own_equations)
     return float(np.linalg.norm(forces[carried]))

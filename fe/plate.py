@@ -1,13 +1,13 @@
-"""A rigid plate that tissue touches: taped to it from the first touch on, or free to slide along it.
+"""Contact of tissue with a rigid plate: bonded (taped) from first contact on, or sliding without friction.
 
-Its rotation adds three unknowns to the sparse system of all others. Nodes on a plate that turns by a small vector t
-about its pivot c move by t x r, r = x - c. With f their internal forces, the moment is sum r x f, and the second
-variation of the energy has, beside w_k . K w_l (w_k = e_k x r, K the tangent), the part of the curved path
+The rotation of the plate adds three unknowns to the sparse system. Nodes on a plate that rotates by a small vector t
+about its pivot c move by t x r, r = x - c. With f their internal forces, the moment is sum r x f. In addition to
+w_k . K w_l (w_k = e_k x r, K the tangent), the second variation of the energy contains the term of the curved path
 
     sum  (r f^T + f r^T) / 2 - (r . f) I,
 
 which is symmetric. The system [K B; B^T C] [x; t] = [right; moment] is solved by elimination of x, so that K, its
-pattern and its factorisation are those of a plate that does not turn.
+pattern and its factorisation are those of a plate that does not rotate.
 """
 
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
 
 _BEYOND_MM = 0.5
-_SAME_MM = 1e-6  # nodes whose heights differ by less touch together, whatever the frame does to the last digits
+_SAME_MM = 1e-6  # nodes whose heights differ by less touch together, independent of rounding
 _LEAST_ARM_MM = 1e-3
 _ACCURACY = 1e-3  # of the linear solutions for a rotation
 
@@ -37,28 +37,29 @@ class Plate:
     normal : (3,)
         Outward normal, from the tissue to the plate, LPS; the normal force on the tissue is opposite.
     shear : (3,)
-        Direction of the shear force on the tissue, LPS; what it has along the normal is taken out.
+        Direction of the shear force on the tissue, LPS; its component along the normal is removed.
     gap_mm : float
-        Distance from the surface that it will touch first, at the start.
+        Initial distance between the plate and the skin, mm.
     taped : bool
-        Whether a node that has touched never slides or leaves again; if not, it slides without friction, and may leave.
+        Whether a node that has touched the plate sticks to it; otherwise it slides without friction and may separate.
     turns : bool
-        Whether it turns freely about its pivot, in all three axes, once it presses; if not, it stays parallel.
+        Whether the plate rotates freely about its pivot, in all three axes, once it presses; otherwise it stays
+        parallel.
     pivot_mm : (3,), optional
-        Point in front of which the pivot lies on the plate's face at the start, LPS; by default the place on the
-        surface that is touched first. The pivot moves with the plate, and moments are given about it.
+        Point whose projection onto the plate's face is the pivot at the start, LPS; by default the point of first
+        contact. The pivot moves with the plate, and moments are given about it.
 
     Attributes
     ----------
     axes : (3, 3)
-        Columns are the plate's axes at the start, LPS: that of the normal force on the tissue, of shear, and their
-        cross product.
+        Columns are the plate's axes at the start, LPS: the directions of the normal force on the tissue, of shear, and
+        their cross product.
 
     Raises
     ------
     InputError
-        If a direction is not three finite numbers or is zero, or the two are parallel; if the gap is negative, the
-        pivot is no point, or a plate without tape turns.
+        If a direction is not three finite numbers or is zero, or the two are parallel; if the gap is negative or the
+        pivot is not a point; or if a plate without tape is to rotate.
     """
 
     normal: npt.ArrayLike
@@ -73,29 +74,32 @@ class Plate:
         if not (np.isfinite(self.gap_mm) and self.gap_mm >= 0.0):
             raise InputError(f"The gap between plate and tissue must be 0 mm or more; got {self.gap_mm}.")
         if self.turns and not self.taped:
-            raise InputError("A plate without friction that turns would slip off: let it turn on tape, or stay level.")
+            raise InputError(
+                "A freely rotating plate (turns) needs taped skin: without friction the plate would slip off. Set "
+                "taped to True, or turns to False."
+            )
         if self.pivot_mm is not None:
             pivot = np.asarray(self.pivot_mm, dtype=np.float64)
             if pivot.shape != (3,) or not np.isfinite(pivot).all():
-                raise InputError(f"The plate's pivot is a point, three finite coordinates in mm; got {self.pivot_mm}.")
+                raise InputError(f"The plate's pivot needs three finite coordinates in mm; got {self.pivot_mm}.")
         object.__setattr__(self, "axes", plate_axes(-frozen(self.normal, np.float64), self.shear))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactStatus:
-    """Which nodes are in contact with the plate, where on it, and how it is turned."""
+    """The nodes in contact with the plate, their positions on it, and its rotation."""
 
     nodes: BoolArray  # (s,) of those that may touch
-    places_mm: FloatArray  # (s, 3) from the pivot, along axes that turn with the plate; NaN without contact
-    rotation: FloatArray  # (3, 3) of those axes against the plate's axes at the start
-    turns: bool  # whether the plate turns freely now
+    places_mm: FloatArray  # (s, 3) from the pivot, along axes that rotate with the plate; NaN without contact
+    rotation: FloatArray  # (3, 3) of those axes relative to the plate's axes at the start
+    turns: bool  # whether the plate rotates freely now
 
 
 class Contact:
     """The nodes on the plate, in the plate's axes at the start (the first is that of the normal force).
 
     ``nodes_mm`` (n, 3) are the reference positions of all nodes, ``surface`` (s,) those that may touch. InputError if
-    other tissue lies nearer to the plate: the plate comes from the wrong side.
+    other tissue is closer to the plate, because the plate then comes from the wrong side.
     """
 
     def __init__(self, plate: Plate, nodes_mm: FloatArray, surface: IntArray) -> None:
@@ -114,8 +118,8 @@ class Contact:
         nearest = float(nodes_mm[:, 0].min())
         if nearest < face_mm - _BEYOND_MM:
             raise InputError(
-                f"The plate would pass through {face_mm - nearest:.1f} mm of tissue that is not its surface "
-                "before it touches that. Its normal points away from the tissue, on the side that is to be pressed."
+                f"The plate would pass through {face_mm - nearest:.1f} mm of other tissue before it touches the skin. "
+                "Its normal must point away from the tissue, on the side that is pressed; check its direction."
             )
 
     @property
@@ -125,17 +129,17 @@ class Contact:
 
     @property
     def followers(self) -> dict[int, IntArray]:
-        """Unknowns that follow each of the plate's three displacements."""
+        """Unknowns that follow each of the three displacements of the plate."""
         return {axis: 3 * self.held + axis for axis in range(3 if self.plate.taped else 1)}
 
     def touch_first(self, state: FloatArray) -> None:
-        """Move the plate to the surface, onto its lowest node or nodes."""
+        """Move the plate to the surface node, or nodes, that it touches first."""
         places = np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan)
         self.status = replace(self.status, nodes=self._first, places_mm=places)
         state[3 * self.held] = self._pivot[0] - self._start[self._first, 0]
 
     def begin(self, state: FloatArray) -> None:
-        """Remember a state of equilibrium, from which the next one is sought."""
+        """Store an equilibrium state as the start of the next increment."""
         self._before = self._seen_from_plate(state)
 
     def centre_mm(self, state: FloatArray) -> FloatArray:
@@ -152,7 +156,7 @@ class Contact:
         return np.asarray(self.centre_mm(state) - self._pivot + [self.plate.gap_mm, 0.0, 0.0])
 
     def arms_mm(self, state: FloatArray) -> FloatArray:
-        """From the pivot to each node on the plate (k, 3), mm."""
+        """Vectors from the pivot to each node on the plate (k, 3), mm."""
         return self._positions(state)[self.status.nodes] - self.centre_mm(state)
 
     def force_n(self, forces: FloatArray) -> FloatArray:
@@ -164,10 +168,10 @@ class Contact:
         return np.asarray(np.cross(self.arms_mm(state), forces[_unknowns(self.held)]).sum(axis=0))
 
     def update(self, state: FloatArray, forces: FloatArray) -> bool:
-        """Take up nodes past the plate and, without tape, release those that it would pull; whether any changed.
+        """Add nodes that have passed the plate and, without tape, release those that it would pull; whether any did.
 
-        ``state`` is changed in place: nodes that touch are put onto the plate's face, along its normal and, on tape,
-        across it to where they crossed the face on a straight way from the state before, as seen from the plate.
+        ``state`` is changed in place. Nodes that touch are moved onto the plate's face: without tape along its normal;
+        with tape to where they crossed the face on a straight line from the previous state, as seen from the plate.
         ``forces`` (unknowns,) are internal, N.
         """
         status, now, before = self.status, self._seen_from_plate(state), self._before
@@ -193,7 +197,7 @@ class Contact:
         return self._start + state[_unknowns(self.nodes)]
 
     def _seen_from_plate(self, state: FloatArray) -> FloatArray:
-        """Positions (s, 3) from the pivot, along the axes that turn with the plate; past its face the first is < 0."""
+        """Positions (s, 3) from the pivot, along axes that rotate with the plate; the first is < 0 past its face."""
         return np.asarray((self._positions(state) - self.centre_mm(state)) @ self.status.rotation)
 
 
@@ -202,16 +206,16 @@ def _unknowns(nodes: IntArray) -> IntArray:
 
 
 class Parallel:
-    """A plate that stays parallel: it has no unknowns of rotation."""
+    """A plate that stays parallel; it has no rotational unknowns."""
 
     def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
-        """Imbalance of the moment, N; none, as it takes up any."""
+        """Residual moment, N; zero, because a parallel plate carries any moment."""
         return 0.0
 
     def solved(
         self, state: FloatArray, forces: FloatArray, data: FloatArray, level: FloatArray, held: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Change of every equation, ``level`` as it is, and the turn (3,), none."""
+        """Change of every equation, equal to ``level``, and a zero rotation (3,)."""
         return level, np.zeros(3)
 
     def ahead(self, state: FloatArray, change: FloatArray, turn: FloatArray) -> FloatArray:
@@ -220,7 +224,7 @@ class Parallel:
 
 
 class Turning(Parallel):
-    """A plate that turns until its moment about the pivot is ``moment_nmm`` (3,); it turns ``contact`` in place."""
+    """A plate that rotates until its moment about the pivot is ``moment_nmm`` (3,); it rotates ``contact`` in place."""
 
     def __init__(self, contact: Contact, assembler: Assembler, solver: Solver, moment_nmm: FloatArray) -> None:
         self._contact, self._assembler, self._solver = contact, assembler, solver
@@ -229,7 +233,7 @@ class Turning(Parallel):
         self._arms, self._on_plate = np.empty((0, 3)), np.empty((0, 3), dtype=int)
 
     def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
-        """Imbalance of the moment, N: over the root mean square arm of the nodes on the plate."""
+        """Residual moment divided by the root mean square lever arm of the nodes on the plate, N."""
         arm = float(np.sqrt((self._contact.arms_mm(state) ** 2).sum(axis=1).mean()))
         missing = self._moment - self._contact.moment_nmm(state, forces)
         return float(np.linalg.norm(missing)) / max(arm, _LEAST_ARM_MM)
@@ -237,10 +241,10 @@ class Turning(Parallel):
     def solved(
         self, state: FloatArray, forces: FloatArray, data: FloatArray, level: FloatArray, held: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Change of every equation and the turn (3,), from ``level``, the change (equations,) of a level plate.
+        """Change of every equation and the rotation (3,); ``level`` is the change (equations,) with a parallel plate.
 
-        ``data`` are the tangent's values, with ``held`` equations prescribed. SingularError if the tissue does not hold
-        the plate against turning.
+        ``data`` are the values of the tangent, with ``held`` equations prescribed. SingularError if the tissue does not
+        resist a rotation of the plate.
         """
         self._rotation = self._contact.status.rotation
         self._arms = self._contact.arms_mm(state)
@@ -260,11 +264,11 @@ class Turning(Parallel):
         try:
             turn = np.linalg.solve(own - right.T @ answers, missing - coupled.T @ level)
         except np.linalg.LinAlgError as failure:
-            raise SingularError("The plate is not held against turning.") from failure
+            raise SingularError("The tissue does not resist a rotation of the plate.") from failure
         return level - answers @ turn, turn
 
     def ahead(self, state: FloatArray, change: FloatArray, turn: FloatArray) -> FloatArray:
-        """The state after a change of all unknowns and a turn, rigid on the plate; the plate is turned to match."""
+        """The state after a change of all unknowns and a rigid rotation of the nodes on the plate and of the plate."""
         turned = Rotation.from_rotvec(turn).as_matrix()
         tried = state + change
         tried[self._on_plate] += self._arms @ (turned - np.eye(3)).T

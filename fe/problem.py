@@ -21,36 +21,36 @@ from fe.plate import Contact, Plate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateTarget:
-    """What the plate is to reach along each of its three axes: a force, or a displacement."""
+    """Target of the plate along each of its three axes: a force or a displacement."""
 
     values: FloatArray  # (3,) forces in N, displacements from the plate's start in mm
     displaced: BoolArray  # (3,) axes along which a displacement is prescribed
 
     @property
     def sheared(self) -> bool:
-        """Whether it asks for a force or a displacement across the normal."""
+        """Whether there is a force or a displacement across the normal."""
         return bool(self.values[1:].any() or self.displaced[1:].any())
 
     def unsheared(self) -> Self:
-        """The same along the normal, without a force across it."""
+        """The same target along the normal, without a force across it."""
         return replace(self, values=self.values * [1.0, 0.0, 0.0], displaced=self.displaced & [True, False, False])
 
 
 @dataclass(frozen=True, slots=True)
 class LoadStep:
-    """A load, reached from the one before it: a force or a plate displacement along the normal, and one across it.
+    """A load case: a force or a plate displacement along the normal, and optionally one along the shear.
 
     Attributes
     ----------
     normal_n, shear_n : float, optional
-        Force of the plate on the tissue along the normal force's and the shear's direction, N.
+        Force of the plate on the tissue, N, along the directions of the normal force and of shear.
     normal_mm, shear_mm : float, optional
-        In its place, the plate's displacement from its start, mm.
+        Displacement of the plate from its start, mm, instead of the force.
 
     Raises
     ------
     InputError
-        Unless exactly one of the two is given along the normal, and at most one along the shear.
+        Unless exactly one of force and displacement is given along the normal, and at most one along the shear.
     """
 
     name: str
@@ -62,18 +62,18 @@ class LoadStep:
     def __post_init__(self) -> None:
         check_fields(self)
         if (self.normal_n is None) == (self.normal_mm is None):
-            raise InputError(f"{self.name}: give either the normal force or the plate's displacement along it.")
+            raise InputError(f"{self.name}: give either the normal force or the plate displacement along the normal.")
         if self.shear_n is not None and self.shear_mm is not None:
-            raise InputError(f"{self.name}: give either the shear force or the plate's displacement along it.")
+            raise InputError(f"{self.name}: give either the shear force or the plate displacement along the shear.")
 
     @property
     def sheared(self) -> bool:
-        """Whether it asks for a shear, as force or as displacement."""
+        """Whether there is a shear, as a force or a displacement."""
         return self.target.sheared
 
     @property
     def target(self) -> PlateTarget:
-        """What it asks of the plate along its three axes."""
+        """Force or displacement of the plate along its three axes."""
         asked = [(self.normal_n, self.normal_mm), (self.shear_n, self.shear_mm), (0.0, None)]
         return PlateTarget(
             np.array([force or 0.0 if moved is None else moved for force, moved in asked]),
@@ -81,7 +81,7 @@ class LoadStep:
         )
 
     def __str__(self) -> str:
-        """The load in words, such as "15 N normal, 8 mm shear"."""
+        """The load as text, such as "15 N normal, 8 mm shear"."""
         target = self.target
         normal, shear, _ = (
             f"{value:g} {'mm' if moved else 'N'}" for value, moved in zip(target.values, target.displaced, strict=True)
@@ -92,10 +92,12 @@ class LoadStep:
 def paths_of(
     loads: Sequence[LoadStep], directions: Mapping[str, Hashable] = MappingProxyType({})
 ) -> list[tuple[LoadStep, ...]]:
-    """Loads by path: pressed alike and sheared to the same side, by force or by displacement, in the order of shear.
+    """Group loads into load paths, each in the order of increasing shear.
 
-    A load without shear lies on the path of the first that is pressed like it and sheared. ``directions`` holds those
-    of loads that have their own; only loads of the same directions lie on one path.
+    Loads of one path have the same normal force (or displacement), the same sign of the shear, and all a shear force or
+    all a shear displacement. A load without shear belongs to the path of the first sheared load with the same normal
+    force. ``directions`` gives the directions of loads that have their own; only loads with the same directions are on
+    one path.
 
     Raises
     ------
@@ -110,7 +112,7 @@ def paths_of(
     """
     names = [load.name for load in loads]
     if not names or len(set(names)) < len(names):
-        raise InputError(f"Loads are needed, each with a name of its own; got {', '.join(names) or 'none'}.")
+        raise InputError(f"At least one load is needed, and names must be unique; got {', '.join(names) or 'none'}.")
 
     def pressed(load: LoadStep) -> tuple[float, bool, Hashable]:
         return float(load.target.values[0]), bool(load.target.displaced[0]), directions.get(load.name)
@@ -128,7 +130,7 @@ def paths_of(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Soft tissue that a rigid plate presses and shears, along one path of loads.
+    """Soft tissue that a rigid plate presses and shears, along one load path.
 
     Attributes
     ----------
@@ -136,14 +138,14 @@ class Problem:
         As in `fe.simulate`, with one plate; every cell of the mesh is in one region.
     materials : mapping of region to Material
     loads : sequence of LoadStep
-        Reached one from the other. The first must press.
+        In sequence: each starts from the state of the previous one. The first must press.
 
     Raises
     ------
     InputError
-        If an argument is of another kind, such as a file's path in place of a mesh; if a region has no material or a
-        cell no region, a surface set is missing, tissue is joined to nothing that is fixed, the plate comes from the
-        wrong side, or a load cannot be brought onto tissue.
+        If an argument has the wrong type, such as a file path in place of a mesh; if a region has no material, a cell
+        has no region, or a surface set is missing; if tissue is not connected to a fixed surface; if the plate comes
+        from the wrong side; or if a load cannot be applied by the plate.
     """
 
     mesh: TetMesh
@@ -158,12 +160,12 @@ class Problem:
         check_fields(self)
         mesh, fixed = self.mesh, self.fixed
         if not fixed:
-            raise InputError("No surface set is fixed: tissue that nothing holds cannot be pressed.")
+            raise InputError(f"No surface set is fixed, so the tissue has no support. Fix at least '{BONE}'.")
         for name in (*fixed, SKIN):
             if name not in mesh.facets:
                 raise InputError(
-                    f"The mesh has no facets '{name}'; it has {', '.join(mesh.facets) or 'none'}. The bone's interface "
-                    f"is called '{BONE}' and is fixed, the surface that the plate touches '{SKIN}'."
+                    f"The mesh has no surface set '{name}'; it has {', '.join(mesh.facets) or 'none'}. Name the "
+                    f"interface with bone, which is fixed, '{BONE}', and the surface that the plate touches '{SKIN}'."
                 )
         check_materials(mesh, self.materials)
         check_loads(self.plate, self.loads)
@@ -171,7 +173,7 @@ class Problem:
         _check_bonded(mesh, held, fixed)
         on_surface = np.setdiff1d(np.unique(mesh.facets[SKIN]), held)
         if not len(on_surface):
-            raise InputError(f"All of '{SKIN}' is fixed ({', '.join(fixed)}): the plate has nothing to touch.")
+            raise InputError(f"All nodes of '{SKIN}' are fixed ({', '.join(fixed)}), so the plate cannot deform it.")
         Contact(self.plate, mesh.points_mm @ self.plate.axes, on_surface)
 
 
@@ -180,7 +182,7 @@ def problems_of(
     mesh: TetMesh, materials: Materials, plate: Plate | Mapping[str, Plate], loads: Sequence[LoadStep],
     fixed: Sequence[str] = (BONE,), element: str = "P1",
 ) -> list[Problem]:  # fmt: skip
-    """A problem for each path that the loads lie on (`fe.paths_of`); ``plate`` may be one for each load, by its name.
+    """One problem for each load path (`fe.paths_of`); ``plate`` is one for all loads, or a mapping from load names.
 
     Raises
     ------
@@ -188,32 +190,34 @@ def problems_of(
         As `Problem`, or if a load has no plate.
     """
     if isinstance(plate, Mapping) and (bare := [load.name for load in loads if load.name not in plate]):
-        raise InputError(f"plate has none for {', '.join(bare)}; it has one for {', '.join(plate) or 'no load'}.")
+        raise InputError(
+            f"The mapping 'plate' has no plate for {', '.join(bare)}; it has one for {', '.join(plate) or 'no load'}."
+        )
     plate_of = {load.name: plate if isinstance(plate, Plate) else plate[load.name] for load in loads}
     paths = paths_of(loads, {name: tuple(one.axes.round(9).ravel()) for name, one in plate_of.items()})
     return [Problem(mesh, materials, plate_of[path[0].name], path, fixed, element) for path in paths]
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
-    """Refuse loads that a plate cannot bring onto tissue, with an `InputError`."""
+    """InputError for loads that a plate cannot apply to tissue."""
     if not loads:
-        raise InputError("No load is given.")
+        raise InputError("At least one load is needed.")
     for load in loads:
         value, displaced = load.target.values[0], load.target.displaced[0]
         least, kind = (plate.gap_mm, "displacement") if displaced else (0.0, "force")
         if not (np.isfinite(load.target.values).all() and value > least):
-            above = f"{least:g} mm, the gap" if displaced else "0 N"
+            above = f"{least:g} mm (the gap)" if displaced else "0 N"
             raise InputError(
-                f"{load.name}: the normal {kind} must press, above {above}; got {load}. The plate's normal points away "
-                "from the tissue."
+                f"{load.name}: the normal {kind} must be above {above}, so that the plate presses; got {load}. "
+                "Positive values press, against the plate's outward normal."
             )
         if load.sheared and not plate.taped:
-            raise InputError(f"{load.name}: a plate without friction carries no shear; got {load}.")
+            raise InputError(f"{load.name}: a plate without friction cannot apply shear; got {load}.")
 
 
 @checked
 def check_materials(mesh: TetMesh, materials: Materials) -> None:
-    """Refuse a mesh of which a cell has no material, or more than one, with an `InputError`."""
+    """InputError unless every cell of a mesh has exactly one material."""
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
         if region not in mesh.regions:
@@ -223,13 +227,13 @@ def check_materials(mesh: TetMesh, materials: Materials) -> None:
         bare, twice = int((times == 0).sum()), int((times > 1).sum())
         without = ", ".join(name for name in mesh.regions if name not in materials)
         raise InputError(
-            f"Every cell needs one material law: {bare} have none and {twice} more than one. Regions without one: "
-            f"{without or 'none'}."
+            f"Every cell needs exactly one material: {bare} cells have none and {twice} have more than one. Regions "
+            f"without a material: {without or 'none'}."
         )
 
 
 def _check_bonded(mesh: TetMesh, held: IntArray, fixed: Sequence[str]) -> None:
-    """Refuse tissue that nothing holds: cells whose nodes are joined to no fixed one."""
+    """InputError for cells that are not connected to a fixed node."""
     ends = np.repeat(mesh.cells[:, 0], 3), mesh.cells[:, 1:].ravel()
     count = len(mesh.points_mm)
     joined = sparse.csr_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(count, count))
@@ -237,6 +241,6 @@ def _check_bonded(mesh: TetMesh, held: IntArray, fixed: Sequence[str]) -> None:
     loose = ~np.isin(part[mesh.cells[:, 0]], part[held])
     if loose.any():
         raise InputError(
-            f"{int(loose.sum())} of {len(loose)} cells are not joined to what is fixed ({', '.join(fixed)}): tissues "
-            "are bonded where they share nodes. Merge coincident nodes where the mesh was made."
+            f"{int(loose.sum())} of {len(loose)} cells are not connected to a fixed surface ({', '.join(fixed)}). "
+            "Tissues are bonded only where they share nodes; merge coincident nodes in the meshing program."
         )

@@ -1,4 +1,4 @@
-"""Material parameter sets, tissue by tissue: seven published ones, and the user's own in the same form."""
+"""Material sets: seven published ones, and your own in the same file format."""
 
 import difflib
 import inspect
@@ -17,12 +17,12 @@ from fe.hyperelastic import OGDEN
 from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 
 WHOLE = "all"
-"""Name of the tissue in a set that has one material law for everything."""
+"""Name of the tissue in a set that has one constitutive model for all tissues."""
 
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
-_Constructor = Callable[..., Material]  # its parameters are the numbers that a file gives; stresses end in _mpa
+_Constructor = Callable[..., Material]  # its parameters are the keys of the file; stresses end in _mpa
 _LAWS: Mapping[str, _Constructor] = {"neo-Hooke": NeoHooke.of, "Yeoh": Yeoh.of, "linear elastic": Hencky.of}
 _OGDEN: Mapping[str, _Constructor] = {
     "ansys": Ogden.from_ansys, "abaqus": Ogden.from_abaqus, "febio": Ogden.from_febio
@@ -32,14 +32,14 @@ _TO_MPA = {"_mpa": 1.0, "_kpa": 1e-3}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaterialSet:
-    """A material parameter set: a constitutive model with its parameters for each tissue.
+    """A material set: a constitutive model with its parameters for each tissue.
 
     Attributes
     ----------
     name, title, source : str
-        Short name, who proposed it, and where the numbers are printed.
+        Short name, authors, and where the parameters were published.
     materials : mapping of tissue to Material
-        "all" where one serves every tissue.
+        The key "all" stands for one material for every tissue.
     """
 
     name: str
@@ -48,21 +48,21 @@ class MaterialSet:
     materials: Materials
 
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
-        """The material law of each region of a mesh, and a sentence for each region that has none of its own.
+        """The material of each region of a mesh, and a sentence for each region that gets that of another tissue.
 
-        Tendon and aponeurosis without one take muscle's, or else fat's; muscle takes fat's. No other region takes
-        another's.
+        Tendon and aponeurosis without a material get that of muscle, or else of fat; muscle gets that of fat. No other
+        substitution is made.
 
         Raises
         ------
         InputError
-            If a region has no material law and the set none to put in its place.
+            If a region has no material in the set and no substitute.
 
         Examples
         --------
         >>> materials, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
         >>> materials["muscle"] is materials["fat"], notes
-        (True, ("friedman has no material law for muscle; fat's is used.",))
+        (True, ('friedman has no material for muscle; that of fat is used.',))
         """
         by_region, notes = dict[str, Material](), []
         if WHOLE in self.materials:
@@ -72,24 +72,24 @@ class MaterialSet:
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
             name = next((t for t in tried if t.casefold() in known), None)
             if name is None:
-                instead = f", nor one for {' or '.join(tried[1:])} to put in its place" if tried[1:] else ""
+                instead = f" (nor for {' or '.join(tried[1:])}, as a substitute)" if tried[1:] else ""
                 raise InputError(
-                    f"The set {self.name} has no material law for the region '{region}'{instead}; it has "
-                    f"{', '.join(self.materials)}. Add it to the set in a file of your own, or rename the region."
+                    f"The material set {self.name} has no material for the region '{region}'{instead}; it has "
+                    f"{', '.join(self.materials)}. Write your own set with this tissue (.toml), or rename the region."
                 )
             by_region[region] = known[name.casefold()]
             if name != region:
-                notes.append(f"{self.name} has no material law for {region}; {name}'s is used.")
+                notes.append(f"{self.name} has no material for {region}; that of {name} is used.")
         return by_region, tuple(notes)
 
 
 def published_names() -> list[str]:
-    """Names of the sets that come with mrstrain."""
+    """Names of the material sets that are included in mrstrain."""
     return list(_published())
 
 
 def material_set(name: str | Path) -> MaterialSet:
-    """A published set by its name, or the only set of a user's file by its path (.toml).
+    """A published material set by its name, or the only set in your own file by its path (.toml).
 
     Raises
     ------
@@ -104,40 +104,44 @@ def material_set(name: str | Path) -> MaterialSet:
     if str(name).endswith(".toml"):
         sets = read_material_sets(name)
         if len(sets) > 1:
-            raise InputError(f"{name} holds {len(sets)} sets ({', '.join(sets)}); split it, or read them all.")
+            raise InputError(
+                f"{name} contains {len(sets)} material sets ({', '.join(sets)}), and one is needed. Write one file per "
+                "set, or read all with fe.read_material_sets."
+            )
         return next(iter(sets.values()))
     known = _published()
     if name not in known:
         near = difflib.get_close_matches(str(name), known, n=1)
-        hint = f"; the nearest is '{near[0]}'" if near else ""
-        raise InputError(f"No material set '{name}'{hint}. There are {', '.join(known)}; or give a file (.toml).")
+        hint = f"; did you mean '{near[0]}'?" if near else "."
+        raise InputError(f"Unknown material set '{name}'{hint} Available are {', '.join(known)}, or your own .toml.")
     return known[str(name)]
 
 
 def as_material_set(given: MaterialSet | Materials | Path | str) -> MaterialSet:
-    """A set as it is, by its name or file, or of materials by region."""
+    """A material set from a set, a name, a file, or a mapping of region to material."""
     if isinstance(given, (str, Path)):
         return material_set(given)
     return given if isinstance(given, MaterialSet) else MaterialSet("materials", "", "", dict(given))
 
 
 def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
-    """Every set of a file, by name; the form is that of ``fe/published.toml``.
+    """All material sets of a file, by name; the format is that of ``fe/published.toml``.
 
     Raises
     ------
     InputError
-        If the file cannot be read, a key is unknown or missing, or a number is out of range; with file, set and tissue.
+        If the file cannot be read, a key is unknown or missing, or a number is out of range. The message names file,
+        set and tissue.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as failure:
-        raise InputError(f"Cannot read the material sets {path}: {failure}.") from failure
+        raise InputError(f"{path}: the material sets cannot be read ({failure}).") from failure
     return _parsed(str(path), text)
 
 
 def as_toml(name: str, title: str, materials: Materials) -> str:
-    """A set as text in the form that `read_material_sets` takes; Ogden's numbers in the convention of Abaqus.
+    """A material set as TOML text for `read_material_sets`; Ogden parameters in the convention of Abaqus.
 
     Examples
     --------
@@ -165,7 +169,7 @@ def _key(name: str) -> str:
 
 
 def _numbers_of(law: Material) -> dict[str, object]:
-    """The name and numbers of a material law as a file has them."""
+    """The keys and values of a constitutive model in a file."""
     numbers: dict[str, object] = {f"{name.lower()}_mpa": value for name, value in law.moduli_mpa.items()}
     if isinstance(law, Ogden):
         mu, alpha = law.vector[OGDEN::2].tolist(), law.vector[OGDEN + 1 :: 2].tolist()
@@ -186,21 +190,23 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
     sets = {}
     for name, content in tables.items():
         if not isinstance(content, dict):
-            raise InputError(f"{where}: '{name}' is outside any set; a file starts with the set's name in brackets.")
+            raise InputError(
+                f"{where}: '{name}' does not belong to a set; a set begins with its name in brackets, such as [mine]."
+            )
         head = {key: content.get(key, "") for key in ("title", "source")}
         tissues = {key: value for key, value in content.items() if key not in head}
         if not tissues:
-            raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a material law.")
+            raise InputError(f"{where}: the set '{name}' has no tissue; add a table such as [{name}.fat] with a 'law'.")
         materials = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
         sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(materials))
     if not sets:
-        raise InputError(f"{where}: no material set in it.")
+        raise InputError(f"{where}: the file contains no material set.")
     return sets
 
 
 def _law(where: str, given: object) -> Material:
     if not isinstance(given, dict):
-        raise InputError(f"{where}: a tissue is a table with a material law and its numbers; got {given!r}.")
+        raise InputError(f"{where}: a tissue must be a table with 'law' and its parameters; got {given!r}.")
     law = given.get("law")
     made = _constructor(where, law, given.get("convention"))
     taken = inspect.signature(made).parameters
@@ -214,7 +220,7 @@ def _law(where: str, given: object) -> Material:
             raise InputError(f"{where}: '{key}' needs its unit: {key}_kpa or {key}_mpa.")
         if argument not in taken:
             wanted = ", ".join(name.replace("_mpa", "_kpa (or _mpa)") for name in taken)
-            raise InputError(f"{where}: {law} has no '{key}'; it takes {wanted}.")
+            raise InputError(f"{where}: the model {law} has no parameter '{key}'; its parameters are {wanted}.")
         if argument in values:
             raise InputError(f"{where}: '{bare}' is given twice.")
         values[argument] = _numbers(where, key, value, scale or 1.0, several=law == "Ogden" and bare != "nu")
@@ -230,15 +236,15 @@ def _law(where: str, given: object) -> Material:
 def _constructor(where: str, law: object, convention: object) -> _Constructor:
     if law == "Ogden" and convention not in _OGDEN:
         raise InputError(
-            f"{where}: an Ogden law needs convention = {' or '.join(map(repr, _OGDEN))}, the program that its numbers "
-            f"are for: the same numbers differ by a factor of alpha / 2 in stiffness; got {convention!r}."
+            f"{where}: an Ogden model needs convention = {' or '.join(map(repr, _OGDEN))}; got {convention!r}. "
+            "Programs define mu differently: the same mu gives stiffnesses that differ by a factor such as alpha / 2."
         )
     if law == "Ogden":
         return _OGDEN[str(convention)]
     if law not in _LAWS:
         raise InputError(f"{where}: law must be one of {', '.join((*_LAWS, 'Ogden'))}; got {law!r}.")
     if convention is not None:
-        raise InputError(f"{where}: convention is for Ogden laws only; {law} has one form.")
+        raise InputError(f"{where}: 'convention' is only for Ogden models; remove it for {law}.")
     return _LAWS[str(law)]
 
 

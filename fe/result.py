@@ -1,4 +1,4 @@
-"""Results of a load: stress, volume, figures by region; VTU files for ParaView and tables, written and read back."""
+"""Results of a load: stress, volume, statistics by region; VTU files for ParaView and tables, written and read."""
 
 import csv
 from collections.abc import Sequence
@@ -19,14 +19,14 @@ from fe.materials import Materials
 from fe.solution import LoadState
 
 _SHARES = (0.5, 0.9, 0.99)
-_FAR = 0.05  # det F of a patch further from the material law's than this is counted
+_FAR = 0.05  # difference of det F between a patch and the constitutive model, above which the volume is counted
 PLATE_VECTORS = {
     "displacement_mm": "travel_mm",
     "force_n": "force_n",
     "turn_deg": "turn_deg",
     "moment_nmm": "moment_nmm",
 }
-"""Vectors of a plate's state, and what files call them."""
+"""Vectors of a plate's state, and their names in files."""
 _COLUMNS = {
     vector: [name.replace("_", f"_{axis}_") for axis in ("normal", "shear", "third")]
     for vector, name in PLATE_VECTORS.items()
@@ -34,7 +34,7 @@ _COLUMNS = {
 
 
 def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Materials) -> FloatArray:
-    """Cauchy stress of each cell (m, 3, 3), MPa, LPS: the material law's deviator, and the cell's mean pressure."""
+    """Cauchy stress of each cell (m, 3, 3), MPa, LPS: deviator of the model, and mean pressure of the cell."""
     F = np.eye(3) + state.gradients
     stress = np.empty_like(F)
     for region, law in materials.items():
@@ -47,7 +47,7 @@ def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Materials) -> Floa
 
 
 def equivalent_stress(cauchy_mpa: FloatArray) -> FloatArray:
-    """Von Mises' equivalent (n,) of stresses (n, 3, 3): sqrt(3/2 s : s), s the deviator.
+    """Von Mises equivalent (n,) of stresses (n, 3, 3): sqrt(3/2 s : s), s the deviator.
 
     Examples
     --------
@@ -59,14 +59,17 @@ def equivalent_stress(cauchy_mpa: FloatArray) -> FloatArray:
 
 
 def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
-    """Volume of the cells around each node over that in the reference configuration: det F of its patch, (n,)."""
+    """Volume ratio of the cells around each node (n,), deformed over reference: det F of the nodal patch."""
     nodes = mesh.cells.ravel()
     before = np.bincount(nodes, np.repeat(mesh.volumes_mm3, 4))
     return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
 
 
 def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials) -> float:
-    """Share of the volume where det F of patches (mean of a cell's nodes) is over 0.05 off the law's, 1 + p / K."""
+    """Volume fraction in which det F of the nodal patches differs by over 0.05 from that of the model, 1 + p / K.
+
+    In a cell, det F of the patches is the mean over its nodes.
+    """
     asked = np.empty(len(mesh.cells))
     for region, law in materials.items():
         cells = mesh.regions[region]
@@ -78,26 +81,26 @@ def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials) -> f
 
 @dataclass(frozen=True, slots=True)
 class RegionFigures:
-    """A region under a load; percentiles are of volume.
+    """Statistics of a region under a load; percentiles are by volume.
 
     Attributes
     ----------
     reached : float
-        Share of the load; below 1 the figures are those of the last state in equilibrium.
+        Fraction of the load; below 1, the statistics are those of the last converged increment.
     volume_ml : float
         In the reference configuration.
     shear_p50, shear_p90, shear_p99 : float
         Of the maximum shear strain (E1 - E3) / 2 (Green-Lagrange).
     stress_p50_mpa, stress_p90_mpa, stress_p99_mpa : float
-        Of the equivalent stress (von Mises) of the Cauchy stress.
+        Of the von Mises equivalent of the Cauchy stress.
     above_ml : tuple of float
-        Volume whose maximum shear strain exceeds 0.2, 0.3, 0.4, 0.5.
+        Volume in which the maximum shear strain exceeds 0.2, 0.3, 0.4, 0.5.
     volume_change : float
-        Of the whole region, as a share of its volume.
+        Of the whole region, as a fraction of its volume.
     stable_share : float
-        Share of the volume in which the material law is stable (Drucker) at the strain reached.
+        Volume fraction in which the constitutive model is stable (Drucker) at the strain reached.
     crowded_share : float
-        Share of the volume with det F below `fe.elements.CROWDED`, where the solver adds resistance of its own.
+        Volume fraction with det F below `fe.elements.CROWDED`, where the solver adds a resistance against folding.
     """
 
     load: str
@@ -117,9 +120,9 @@ class RegionFigures:
 
 
 def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> list[RegionFigures]:
-    """Figures of each region under a load, which sum up its strain, stress and volume.
+    """Strain, stress and volume statistics of each region under a load.
 
-    ``materials`` are those of the mesh's regions, one for each; the rows are in their order.
+    ``materials`` has one material for each region of the mesh; the rows are in its order.
     """
     strain = state.strain
     stress = equivalent_stress(cauchy_stress(state, mesh, materials))
@@ -143,7 +146,7 @@ def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> lis
 
 
 def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence[float]) -> tuple[float, ...]:
-    """Values (n,) below which these shares of the volume lie.
+    """Values below which the given fractions (``shares``) of the volume lie.
 
     >>> volume_percentiles(np.array([0.1, 0.3, 0.2]), np.array([1.0, 1.0, 2.0]), [0.5])
     (0.2,)
@@ -155,7 +158,7 @@ def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence
 
 
 def write_regions_csv(path: Path | str, rows: Sequence[RegionFigures]) -> None:
-    """Write the figures of regions as CSV, a row for each load and region; strain without unit, MPa, mL.
+    """Write the statistics of regions as CSV, a row for each load and region; strain without unit, MPa, mL.
 
     `OutputError` if the file cannot be written.
     """
@@ -172,7 +175,7 @@ def write_regions_csv(path: Path | str, rows: Sequence[RegionFigures]) -> None:
 
 
 def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
-    """Write every converged increment: the plate's displacement, force, turn and moment along its axes, its contact."""
+    """Write every converged increment: displacement, force, rotation and moment along the plate's axes; contact."""
     table = []
     for state in states:
         for at in state.curve:
@@ -182,7 +185,7 @@ def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
 
 
 def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
-    """The plate at every converged increment of each load, as `write_curve_csv` wrote it, with eight digits."""
+    """Read the file of `write_curve_csv`: the plate at every converged increment of each load, to eight digits."""
     curves: dict[str, list[PlateState]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
@@ -193,10 +196,10 @@ def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
 
 
 def write_state(path: Path | str, mesh: TetMesh, state: LoadState, materials: Materials) -> None:
-    """Write a load's results as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
+    """Write the results of a load as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
 
-    At nodes: displacement, and det F of the patch around each. In cells: number of the region, F, Green-Lagrange
-    strain, maximum shear strain, det F, pressure (positive in tension) and Cauchy stress.
+    At nodes: displacement, and det F of the nodal patch. In cells: number of the region, F, Green-Lagrange strain,
+    maximum shear strain, det F, pressure (positive in tension) and Cauchy stress.
     """
     strain = state.strain
     region = np.zeros(len(mesh.cells), dtype=np.int64)
@@ -218,7 +221,7 @@ def write_state(path: Path | str, mesh: TetMesh, state: LoadState, materials: Ma
 
 
 def read_state(path: Path) -> tuple[meshio.Mesh, FloatArray, FloatArray, FloatArray]:
-    """A file of `write_state`: its mesh, displacements (n, 3) mm, H = F - I (m, 3, 3), mean pressures (m,) MPa."""
+    """Read a file of `write_state`: mesh, displacement (n, 3) mm, H = F - I (m, 3, 3), mean pressure (m,) MPa."""
     read = meshio.read(path)
     cells = {name: blocks[0] for name, blocks in read.cell_data.items()}
     return read, read.point_data["displacement_mm"], cells["F"].reshape(-1, 3, 3) - np.eye(3), cells["pressure_mpa"]

@@ -1,4 +1,4 @@
-"""A simulation: what a material parameter set gave under its loads, as arrays, as files, as a picture."""
+"""Simulation of a material set under its loads: results as arrays, files and figures."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -27,30 +27,30 @@ from fe.solution import LoadState, Observer, SolverOptions, solve
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MUCH = 0.05  # share of the volume with det F of patches off above which that is noted
-_CROWD = 0.01  # share of a region's volume below det F `CROWDED` above which that is noted
+_MUCH = 0.05  # volume fraction with deviating det F of nodal patches, above which it is noted
+_CROWD = 0.01  # volume fraction of a region with det F below `CROWDED`, above which it is noted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """What a material parameter set gave under its loads.
+    """Results of a material set under its loads.
 
     Attributes
     ----------
     materials : MaterialSet
-        Its materials are those of the mesh's regions.
+        Materials of the mesh's regions.
     mesh : TetMesh
         Undeformed, LPS mm.
     paths : tuple of tuple of LoadStep
-        The loads asked for, each path in the order in which they are reached from one another.
+        The requested loads, each path in the order of simulation.
     states : tuple of LoadState
-        In that order; the last of a path that could not go on has ``reached`` below 1.
+        Results in that order. On an incomplete path, the last one has ``reached`` below 1.
     fixed : tuple of str
-        Surface sets that did not move.
+        Fixed surface sets.
     element : str
         As in `fe.elements`.
     turns : bool
-        Whether the plate turned freely.
+        Whether the plate rotated freely.
     remarks : tuple of str
         Assumptions.
     regions : tuple of RegionFigures
@@ -74,7 +74,7 @@ class Simulation:
 
     @classmethod
     def of(cls, materials: MaterialSet, problems: Sequence[Problem], states: Sequence[LoadState]) -> Self:
-        """The simulation that solved these problems, one for each path, with the states in which their loads ended."""
+        """The simulation of these problems, one for each path, with the final states of their loads."""
         first = problems[0]
         by_region, remarks = materials.for_regions(first.mesh.regions)
         return cls(
@@ -84,17 +84,17 @@ class Simulation:
 
     @property
     def name(self) -> str:
-        """Name of the material parameter set."""
+        """Name of the material set."""
         return self.materials.name
 
     @property
     def loads(self) -> tuple[LoadStep, ...]:
-        """The loads asked for."""
+        """The requested loads."""
         return tuple(load for path in self.paths for load in path)
 
     @property
     def complete(self) -> bool:
-        """Whether every load was reached, with materials that are stable at the strain reached."""
+        """Whether every load was reached, and every material is stable at the strain reached."""
         return len(self.states) == len(self.loads) and not self._unstable and all(s.reached == 1.0 for s in self.states)
 
     @property
@@ -109,33 +109,33 @@ class Simulation:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Assumptions, and what is not to be trusted."""
+        """Assumptions, and warnings about results."""
         reached = {state.load.name for state in self.states}
         notes = [
-            f"{row.load}: the material law of {row.region} is not stable (Drucker) in {1.0 - row.stable_share:.1%} of "
-            "its volume."
+            f"{row.load}: the material of {row.region} is not stable (Drucker) in {1.0 - row.stable_share:.1%} of its "
+            "volume."
             for row in self._unstable
         ]
         notes += [
             f"{row.load}: {row.crowded_share:.1%} of {row.region} is compressed below det F {CROWDED:g}, where the "
-            "solver holds cells open; the material law bears no pressure above its bulk modulus "
-            f"({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa)."
+            "solver adds resistance so that cells do not fold. The material itself cannot carry a pressure above its "
+            f"bulk modulus ({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa)."
             for row in self.regions
             if row.crowded_share > _CROWD
         ]
         for state in self.states:
             if state.out_of_time:
-                began = f"at {state.reached:.0%} of the load; given more, it goes on from there"
+                began = f"at {state.reached:.0%} of the load; a run with a longer limit continues from there"
                 when = began if len(state.curve) > 1 else "before the first equilibrium"
-                notes.append(f"{state.load.name}: its time was over {when}.")
+                notes.append(f"{state.load.name}: the time limit was reached {when}.")
         notes += [
-            f"{load.name} was not tried: the load before it was not reached."
+            f"{load.name} was not tried: the previous load was not reached."
             for load in self.loads
             if load.name not in reached
         ]
         notes += [
-            f"{state.load.name}: det F of nodal patches is over 5 % off the material law's in {share:.0%} of the "
-            "volume; a finer mesh keeps volume better."
+            f"{state.load.name}: det F of nodal patches differs by over 5 % from that of the constitutive model in "
+            f"{share:.0%} of the volume; a finer mesh conserves volume better."
             for state in self.states
             if (share := self._share_off(state)) > _MUCH
         ]
@@ -148,7 +148,7 @@ class Simulation:
         return result.volume_share_off(self.mesh, state, self.materials.materials)
 
     def state(self, load: str) -> LoadState:
-        """The state in which a load ended.
+        """The final state of a load.
 
         Raises
         ------
@@ -157,11 +157,11 @@ class Simulation:
         """
         states = {state.load.name: state for state in self.states}
         if load not in states:
-            raise InputError(f"No load '{load}' was simulated; there are {', '.join(states) or 'none'}.")
+            raise InputError(f"No load '{load}' was simulated; simulated loads: {', '.join(states) or 'none'}.")
         return states[load]
 
     def deformation(self, load: str) -> OnMesh:
-        """The deformation under a load, at any point of the mesh."""
+        """The deformation under a load, which can be evaluated at any point of the mesh."""
         return OnMesh(self.mesh, self.state(load).u_mm)
 
     def cauchy_stress(self, load: str) -> FloatArray:
@@ -173,17 +173,17 @@ class Simulation:
         for state in self.states:
             shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             (push, pull, _), (moved, along, _) = state.force_n, state.plate_displacement_mm
-            force = f"{push:.1f} N and {pull:z.1f} N of shear"
+            force = f"{push:.1f} N normal, {pull:z.1f} N shear"
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
             lines.append(
-                f"{self.name}, {state.load.name}:{part} plate {moved:z.2f} mm in, {along:z.2f} mm along; max. shear "
-                f"strain, median / 90th percentile: {shear}"
+                f"{self.name}, {state.load.name}:{part} plate displacement {moved:z.2f} mm normal, {along:z.2f} mm "
+                f"shear; max. shear strain, median / 90th percentile: {shear}"
             )
         return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
 
     @checked
     def plot(self, loads: Sequence[str] | None = None) -> "Figure":
-        """Maximum shear strain on a slice through the bone's lowest point, a panel for each load; all by default."""
+        """Maximum shear strain in a slice through the lowest point of the bone, one panel per load; all by default."""
         from fe.figures import sagittal_slice
 
         return sagittal_slice(self.mesh, self.states if loads is None else [self.state(name) for name in loads])
@@ -197,8 +197,11 @@ class Simulation:
             plate = (round(float(v), 2) for v in (*state.plate_displacement_mm[:2], *state.force_n[:2]))
             shear = (f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             rows.append((state.load.name, str(state.load), f"{state.reached:.0%}", *plate, *shear))
-        head = ("load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N")
-        title = "Plate, and maximum shear strain of each tissue: median / 90th percentile"
+        head = (
+            "load", "target", "reached", "normal displacement, mm", "shear displacement, mm", "normal force, N",
+            "shear force, N",
+        )  # fmt: skip
+        title = "Plate displacement and force; maximum shear strain of each tissue, median / 90th percentile"
         table = Table(title, (*head, *self.materials.materials), tuple(rows))
         picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
         ended = f"{sum(state.reached == 1.0 for state in self.states)} of {len(self.loads)} loads reached"
@@ -206,7 +209,7 @@ class Simulation:
 
     def parameters(self) -> dict[str, object]:
         """Materials, loads and element as they are written to ``simulation.json``."""
-        turns = "let go to turn about its pivot once it presses" if self.turns else "rotation locked"
+        turns = "free to rotate about its pivot once it presses" if self.turns else "rotation locked"
         return {
             "set": self.name,
             "title": self.materials.title,
@@ -222,21 +225,21 @@ class Simulation:
             },
             "region_numbers_in_vtu": {number: name for number, name in enumerate(self.materials.materials, start=1)},
             "paths": [[asdict(load) for load in path] for path in self.paths],
-            "plate": "rigid; moved to the tissue, then to the forces and travels asked for, no force along the third "
-            f"axis; {turns}",
+            "plate": "rigid; moved into contact, then to the prescribed forces and displacements, no force along the "
+            f"third axis; {turns}",
             "element": f"{self.element}: {DESCRIPTIONS[self.element]}",
         }
 
     def write(self, folder: Path | str, *, record: Mapping[str, object] | None = None, fields: bool = True) -> None:
-        """Write it into a folder, as `mrstrain.simulate` does.
+        """Write the simulation into a folder, as `mrstrain.simulate` does.
 
         Parameters
         ----------
         folder : path
-            Made if it is not there. Gets ``LOAD.vtu`` for each load, ``curve.csv`` (force and displacement of the
-            plate), ``regions.csv``, ``simulation.json`` and pictures.
+            Created if it does not exist. Gets ``LOAD.vtu`` for each load, ``curve.csv`` (force and displacement of the
+            plate), ``regions.csv``, ``simulation.json`` and figures.
         record : mapping, optional
-            Provenance to stand in ``simulation.json``, with "parameters" that contain `parameters` and "fixed".
+            Provenance for ``simulation.json``; its "parameters" contain `parameters` and "fixed".
         fields : bool
             Whether to write the VTU files.
 
@@ -248,7 +251,7 @@ class Simulation:
         from fe import figures
 
         place = Path(folder)
-        with suppress(OSError):  # that the first file cannot be written says as much
+        with suppress(OSError):  # writing the first file reports the error
             place.mkdir(parents=True, exist_ok=True)
         for state in self.states:
             if fields and len(state.curve) > 1:
@@ -262,12 +265,12 @@ class Simulation:
         figures.write_figure(place / "force_travel.png", figures.force_displacement(self.states))
 
     def write_decks(self, folder: Path | str) -> None:
-        """Write each load as decks with quadratic tetrahedra: ``LOAD.inp`` for CalculiX, ``LOAD.feb`` for FEBio 4.
+        """Write input files of each load with quadratic tetrahedra: ``LOAD.inp`` (CalculiX), ``LOAD.feb`` (FEBio 4).
 
         Raises
         ------
         InputError
-            If one of the two does not have the constitutive model of a region.
+            If one of the two does not support the constitutive model of a region.
         """
         given = self.mesh, self.materials.materials
         with suppress(OSError):
@@ -296,22 +299,23 @@ class Simulation:
 
     @classmethod
     def read(cls, folder: Path | str, mesh: TetMesh | None = None) -> Self:
-        """Read what `write` or `mrstrain.simulate` has written.
+        """Read a simulation from the folder of `write` or `mrstrain.simulate`.
 
         Parameters
         ----------
         mesh : TetMesh, optional
-            The one simulated, for its surface sets, which the files do not hold. Without it, outer faces that did not
-            move are called as what was fixed, or "bone", and the rest of the outside "skin".
+            The simulated mesh, for its surface sets, which the files do not contain. Without it, outer faces that did
+            not move are named after the fixed surface set (or "bone" if there are several), and the other outer faces
+            "skin".
 
         Raises
         ------
         InputError
-            If it is no folder of a simulation, a file is damaged, or the mesh is another.
+            If the folder has no simulation, a file is damaged, or the simulation was made on another mesh.
 
         Notes
         -----
-        Plate states on the way to a load have the eight digits of ``curve.csv``; all else is as it was computed.
+        Plate states before the end of a load have the eight digits of ``curve.csv``; everything else is exact.
         """
         return cls(**read_parts(Path(folder), mesh))
 
@@ -327,17 +331,17 @@ def simulate(
     Parameters
     ----------
     mesh : TetMesh
-        Undeformed, LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed.
+        Undeformed, LPS mm, with the surface set "skin", which the plate may touch, and the fixed surface sets.
     materials : MaterialSet, str, path, or mapping of region to Material
-        A set, the name of a published one or the path of a file with one (`fe.material_set`), or a material for each
-        region of the mesh.
-    plate : Plate, or mapping of load's name to Plate
-        Its outward normal and direction of shear, LPS; both are needed, even to press alone.
+        A material set, the name of a published one, the path of a file with one (`fe.material_set`), or a material for
+        each region of the mesh.
+    plate : Plate, or mapping of load name to Plate
+        With its outward normal and direction of shear, LPS; both are needed, even without shear.
     loads : sequence of LoadStep
-        Forces (N) or plate displacements (mm) along these. Those with the same normal force lie on one path, in the
-        order of their shear (`fe.paths_of`).
+        Forces (N) or plate displacements (mm) along these directions. Loads with the same normal force are simulated as
+        one load path, in the order of their shear (`fe.paths_of`).
     fixed : sequence of str
-        Surface sets that do not move.
+        Fixed surface sets.
     element : {"P1", "MINI", "P2"}
         Linear, with a bubble, or quadratic; see `fe.elements`.
     options : SolverOptions, optional
@@ -348,10 +352,10 @@ def simulate(
     Returns
     -------
     Simulation
-        For each load that was begun, ``state(name)`` has the displacement of the nodes (n, 3) mm and the displacement
+        For each load that was started, ``state(name)`` has the displacement of the nodes (n, 3) mm and the displacement
         gradient of the cells (m, 3, 3), both on the undeformed mesh in LPS; ``strain`` from it (Green-Lagrange); the
         pressure (m,) MPa; and the plate's displacement (3,) mm and force (3,) N, along the normal force, the shear and
-        their cross product. `Simulation.regions` sums up strain, stress and volume by region.
+        their cross product. `Simulation.regions` has strain, stress and volume statistics by region.
 
     Raises
     ------
@@ -360,8 +364,8 @@ def simulate(
 
     Notes
     -----
-    A load that cannot be reached is no error: its state is the last converged increment, with ``reached`` below 1,
-    and `Simulation.complete` is False.
+    A load that cannot be reached does not raise an error: its state is the last converged increment, with ``reached``
+    below 1, and `Simulation.complete` is False.
     """
     chosen = as_material_set(materials)
     problems = problems_of(mesh, chosen.for_regions(mesh.regions)[0], plate, loads, fixed, element)

@@ -1,4 +1,4 @@
-"""Files of a simulation: read back, resumed from after an interruption, and removed."""
+"""Files of a simulation: reading results, resuming after an interruption, and removing old files."""
 
 import hashlib
 import io
@@ -33,13 +33,13 @@ _PLATE = [field.name for field in fields(PlateState)]
 
 
 def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
-    """What a `fe.Simulation` is made of, from its folder."""
+    """The arguments of a `fe.Simulation`, read from its folder."""
     try:
         return _parts(place, mesh)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as failure:
         raise InputError(
-            f"{place}: no folder of a simulation, or a file in it is damaged ({type(failure).__name__}: {failure}). "
-            f"It needs {RECORD}, curve.csv and a VTU file for each load, as `mrstrain simulate` writes them."
+            f"{place}: not the folder of a simulation, or a file in it is damaged ({type(failure).__name__}: "
+            f"{failure}). It needs {RECORD}, curve.csv and a VTU file for each load, as written by `mrstrain simulate`."
         ) from failure
 
 
@@ -59,10 +59,10 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
         still = (u_mm[faces] == 0.0).all(axis=(1, 2))
         mesh = TetMesh(first.points, cells, regions, {bone: faces[still], SKIN: faces[~still]})
     elif not (np.array_equal(mesh.points_mm, first.points) and np.array_equal(mesh.cells, cells)):
-        raise InputError(f"{place}: the mesh given is not the one that was simulated.")
+        raise InputError(f"{place}: this simulation was made on another mesh than the one given.")
     undeformed = first, np.zeros_like(first.points), np.zeros((len(cells), 3, 3)), np.zeros(len(cells))
     skin, states = np.unique(mesh.facets[SKIN]), []
-    for name, at in outcome.items():  # no file: its time was over before the first equilibrium
+    for name, at in outcome.items():  # no file: the time limit was reached before the first equilibrium
         _, u_mm, gradients, pressure_mpa = files.get(name, undeformed)
         vectors = {vector: np.array(at[f"plate_{key}"]) for vector, key in PLATE_VECTORS.items()}
         plate, axes = PlateState(**vectors, area_mm2=at["contact_area_mm2"]), np.array(at["plate_axes_lps"])
@@ -89,7 +89,7 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
 
 
 def clear_simulation(folder: Path) -> None:
-    """Remove what an earlier simulation wrote by its own list, so that nothing old stands beside what is new."""
+    """Remove the files of an earlier simulation, listed in its own record, so that old and new are never mixed."""
     try:
         loads = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["outcome"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -100,7 +100,7 @@ def clear_simulation(folder: Path) -> None:
 
 
 def fingerprint(problem: Problem, load_count: int) -> str:
-    """A hash of all that the first loads of a problem depend on, solver and libraries (`dvc.software`) included."""
+    """A hash of everything that the first loads of a problem depend on, with solver and libraries (`dvc.software`)."""
     mesh, plate = problem.mesh, problem.plate
     digest = hashlib.sha256()
 
@@ -121,7 +121,7 @@ def fingerprint(problem: Problem, load_count: int) -> str:
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint, made_from: str) -> None:
-    """Write where a load came to, with the `fingerprint` of what it was made from."""
+    """Write the checkpoint of a load, with the `fingerprint` of its inputs."""
     at = checkpoint
     counts = np.array([at.reached, at.stages, at.iterations, at.seconds])
     arrays: dict[str, Any] = {"made_from": made_from, "counts": counts, "unknowns": at.unknowns}
@@ -132,7 +132,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, made_from: str) -> None
 
 
 def read_checkpoint(path: Path, made_from: str) -> Checkpoint | None:
-    """Where a load came to; None if there is no such file, it is damaged, or was made from something else."""
+    """Read the checkpoint of a load; None if there is no file, it is damaged, or it was made from other inputs."""
     try:
         with np.load(io.BytesIO(path.read_bytes())) as file:
             if str(file["made_from"]) != made_from:

@@ -5,9 +5,9 @@ import numpy as np
 from dvc.arrays import FloatArray, IntArray
 from dvc.mesh import FACES, signed_volumes
 
-_FLAT = 0.02  # of the greatest variance of a border's normals around a node: less, and the border goes on straight
+_FLAT = 0.02  # fraction of the largest variance of the normals around a node, below which a surface counts as straight
 _STEPS = (0.2, 0.1, 0.05, 0.02)  # of the mean edge around a node
-_FARTHEST = 0.4  # of the mean edge: how far a node may go in all
+_FARTHEST = 0.4  # of the mean edge: largest total move of a node
 _PASSES = 12
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
@@ -26,13 +26,13 @@ def dihedral_angles_deg(corners: FloatArray) -> FloatArray:
 
 
 def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, goal_deg: float = 12.0) -> FloatArray:
-    """Nodes (n, 3), mm, moved until dihedral angles are ``goal_deg`` or more from 0 and 180 degrees, or no move helps.
+    """Nodes (n, 3), mm, moved until no dihedral angle is within ``goal_deg`` of 0 or 180 degrees, or no move helps.
 
-    All ``cells`` (m, 4) are oriented alike. Between ``tissue`` (m,) of different labels lies a border on which nodes
-    stay: they slide in its plane or along its edge, and stay put at its corners. Each node of a flat cell tries steps
-    in 26 directions, and takes the one that raises the worst angle of all its cells most, within two fifths of an edge
-    in all: optimisation-based smoothing (L. A. Freitag and C. Ollivier-Gooch 1997,
-    doi:10.1002/(SICI)1097-0207(19971115)40:21<3979::AID-NME251>3.0.CO;2-9), searched without derivatives.
+    All ``cells`` (m, 4) have the same orientation. Cells of different ``tissue`` (m,) meet in an interface. Its nodes
+    stay on it: they slide in its plane or along its edges, and its corners are fixed. Each node of a flat cell tries
+    steps in 26 directions and takes the one that improves the worst angle of its cells most; its total move is at most
+    two fifths of an edge. This is optimisation-based smoothing (L. A. Freitag and C. Ollivier-Gooch 1997,
+    doi:10.1002/(SICI)1097-0207(19971115)40:21<3979::AID-NME251>3.0.CO;2-9), without derivatives.
     """
     points = points_mm.copy()
     free = _freedom(points, cells, tissue)
@@ -51,14 +51,14 @@ def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, go
 
 
 def _goodness(corners: FloatArray, sign: float) -> FloatArray:
-    """Distance of the dihedral angles from flat (...), degrees; negative where a cell is turned inside out."""
+    """Smallest distance of a cell's dihedral angles from 0 and 180 degrees (...); negative for an inverted cell."""
     angles = dihedral_angles_deg(corners)
     worst = np.minimum(angles, 180.0 - angles).min(axis=-1)
     return np.asarray(np.where(signed_volumes(corners) * sign > 0, worst, -1.0))
 
 
 def _freedom(points: FloatArray, cells: IntArray, tissue: IntArray) -> FloatArray:
-    """Where each node may go (n, 3, 3): onto all of space, its border's plane or edge, or nothing."""
+    """Projections (n, 3, 3) onto the directions in which each node may move: all, a plane, an edge, or none."""
     faces = np.concatenate([cells[:, face] for face in FACES])
     _, first, which = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
     which, owner = which.ravel(), np.tile(tissue, 4)
@@ -74,7 +74,7 @@ def _freedom(points: FloatArray, cells: IntArray, tissue: IntArray) -> FloatArra
     free = np.tile(np.eye(3), (len(points), 1, 1))
     nodes = np.unique(border)
     spread, axes = np.linalg.eigh(around[nodes])
-    along = (spread < _FLAT * spread[:, 2:]).astype(float)  # axes that no face around the node leans on
+    along = (spread < _FLAT * spread[:, 2:]).astype(float)  # axes tangential to all faces around the node
     free[nodes] = np.einsum("nik,nk,njk->nij", axes, along, axes)
     return free
 
@@ -82,7 +82,7 @@ def _freedom(points: FloatArray, cells: IntArray, tissue: IntArray) -> FloatArra
 def _move(
     points: FloatArray, start: FloatArray, star: IntArray, sign: float, free: FloatArray, node: int, goal: float
 ) -> bool:
-    """Take one node where the worst of its cells (the star) is best, if one is flat; whether it went anywhere."""
+    """Move a node to where the worst of its cells (the star) is best, if one of them is flat; whether it moved."""
     directions = _DIRECTIONS @ free
     if not directions.any():
         return False

@@ -1,4 +1,4 @@
-"""A problem solved: load after load on one path, and the equilibrium that each of them ends in."""
+"""Solution of a problem: the loads of one path in sequence, and the final state of each load."""
 
 import time
 from collections.abc import Sequence
@@ -17,17 +17,17 @@ from fe.problem import LoadStep, Problem
 
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
-    """How a problem is solved.
+    """Options of the solver.
 
     Attributes
     ----------
     threads : int
         Of the linear algebra.
     limit_s : float
-        Time after which a path of loads ends at its last converged increment, s; a viscous step that is under way is
-        not finished, one of Newton's is.
+        Time after which a load path ends at its last converged increment, s. A Newton iteration that is in progress is
+        completed, a viscous descent is not.
     tolerance : Tolerance
-        When an increment counts as converged.
+        Convergence criterion of an increment.
     """
 
     threads: int = 1
@@ -36,47 +36,47 @@ class SolverOptions:
 
 
 class Observer:
-    """Receives the progress of a solution; this one does nothing with it.
+    """Receives the progress of a solution; this base class ignores it.
 
-    Derive a class of your own, with the methods that are of interest, and give it to `solve` or `simulate`.
+    Derive your own class, override the methods that you need, and give it to `solve` or `simulate`.
     """
 
     def log(self, line: str) -> None:
-        """Take a line for each step."""
+        """Called with a line of text for each step."""
 
     def progress(self, done: float) -> None:
-        """Take the share of all loads that is done, 0 to 1."""
+        """Called with the fraction of all loads that is done, 0 to 1."""
 
     def converged(self, load: LoadStep, checkpoint: Checkpoint) -> None:
-        """Take what it takes to resume from a converged increment on the way to a load."""
+        """Called at a converged increment of a load, with the checkpoint from which it can be resumed."""
 
     def ended(self, state: "LoadState") -> None:
-        """Take the state in which a load ended."""
+        """Called with the final state of a load."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadState:
-    """The last converged increment of a load; vectors in LPS but for those of the plate.
+    """The last converged increment of a load; vectors in LPS, except those of the plate.
 
     Attributes
     ----------
     reached, curve, iterations, seconds
-        As in `fe.Checkpoint`; the curve is empty where there is no plate.
+        As in `fe.Checkpoint`; the curve is empty without a plate.
     u_mm : (n, 3)
         Displacement of the mesh's nodes, mm.
     pressure_mpa : (m,)
         Mean pressure in each cell, positive in tension, MPa.
     gradients : (m, 3, 3)
-        H = du/dX of each cell, reference configuration; its mean where the element's varies.
+        H = du/dX of each cell, reference configuration; the mean over the cell if it varies there.
     on_plate : (k,)
         Nodes in contact with the plate.
     checkpoint : Checkpoint, optional
-        What the next load goes on from.
+        State from which the next load continues.
     out_of_time : bool
-        Whether it ended because its time was over.
+        Whether the load ended because the time limit was reached.
     plate_axes : (3, 3), optional
-        Columns: the directions of the normal force, of shear, and their cross product at the start, LPS; those of the
-        plate's vectors.
+        Axes of the plate's vectors, LPS. Columns: the directions of the normal force, of shear, and their cross product
+        at the start.
     """
 
     load: LoadStep
@@ -104,7 +104,7 @@ class LoadState:
 
     @property
     def force_n(self) -> FloatArray:
-        """Force of the plate on the tissue (3,), N, along its axes at the start; that of what is fixed is opposite."""
+        """Force of the plate on the tissue (3,), N, along its axes at the start; the support force is opposite."""
         return self.plate.force_n
 
     @property
@@ -118,21 +118,21 @@ def solve(
     problem: Problem, options: SolverOptions | None = None, observer: Observer | None = None,
     earlier: Sequence[Checkpoint] = (),
 ) -> list[LoadState]:  # fmt: skip
-    """Press and shear soft tissue with a rigid plate, along one path of loads.
+    """Press and shear soft tissue with a rigid plate, along one load path.
 
     Parameters
     ----------
     options, observer : optional
-        Threads, time limit and tolerance; what receives the progress.
+        Threads, time limit and tolerance; and the observer that receives the progress.
     earlier : sequence of Checkpoint
-        Of the first loads, from an earlier solution of the same problem: they are not solved again. The last may have
-        been on its way.
+        Checkpoints of the first loads, from an earlier solution of the same problem. These loads are not solved again;
+        the last one may be incomplete and is continued.
 
     Returns
     -------
     list of LoadState
-        One for each load. One that cannot be reached ends the list, with its last converged increment and ``reached``
-        below 1.
+        One for each load. A load that cannot be reached is the last in the list, with its last converged increment and
+        ``reached`` below 1.
     """
     options, observer = options or SolverOptions(), observer or Observer()
     mesh, loads, axes = problem.mesh, problem.loads, problem.plate.axes

@@ -1,4 +1,4 @@
-"""Smooth surfaces between the tissues of a label map, and meshes between them that keep the tissues' volumes."""
+"""Smooth interfaces between the tissues of a label map, and meshes that keep the volumes of the tissues."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from dvc.mesh import FACES, signed_volumes
 _PASS_BAND = 0.03  # of a windowed sinc filter: 40 steps of plain relaxation take 7 % of a thin muscle, this takes 0.1 %
 _PASSES = 20
 _FLAT_DEG = 15.0  # between triangles: sharper edges are kept when a surface is thinned
-_AROUND = 2  # voxels around a point that may hold the tissue whose border encloses it
+_AROUND = 2  # voxels around a point that may contain the tissue whose surface encloses it
 _SHIFTS = 3
 _LEAST_LEFT = 0.2  # of a cell's volume, in one shift
 _HALVINGS = 6
@@ -21,7 +21,7 @@ _HALVINGS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Borders:
-    """Triangles between tissues, and between tissue and outside."""
+    """Triangles of the interfaces between tissues, and of the outer surface."""
 
     points_mm: FloatArray  # (n, 3) LPS
     triangles: IntArray  # (m, 3)
@@ -29,10 +29,10 @@ class Borders:
 
 
 def borders_of(labels: LabelMap) -> Borders:
-    """Borders between all labels of a map: surface nets through the voxels' faces, smoothed by a windowed sinc filter.
+    """Interfaces between all labels of a map: surface nets through the voxel faces, smoothed by a windowed sinc filter.
 
-    Surface nets (S. F. Frisken 1999, doi:10.1007/10704282_102) meet where three tissues meet and leave no gap; the
-    filter (G. Taubin and others 1996, doi:10.1007/BFb0015544) smooths without shrinking.
+    Surface nets (S. F. Frisken 1999, doi:10.1007/10704282_102) leave no gap where three tissues meet. The filter
+    (G. Taubin and others 1996, doi:10.1007/BFb0015544) smooths without shrinking.
     """
     import pyvista
 
@@ -41,7 +41,7 @@ def borders_of(labels: LabelMap) -> Borders:
     image["labels"] = labels.labels.astype(np.int32).ravel(order="F")
     net = image.contour_labels("all", output_mesh_type="triangles", smoothing=False)  # closed at the image's edge
     if not net.n_cells:
-        raise MrstrainError("There is no border between tissues in the label map.")
+        raise MrstrainError("The label map is empty: it has no surface or interface to mesh.")
     made = net.smooth_taubin(
         n_iter=_PASSES, pass_band=_PASS_BAND, non_manifold_smoothing=True, normalize_coordinates=True
     )
@@ -51,11 +51,11 @@ def borders_of(labels: LabelMap) -> Borders:
 
 
 def thinned(borders: Borders, off_mm: float) -> tuple[FloatArray, IntArray]:
-    """Points (n, 3), LPS mm, and triangles (m, 3) of the same borders, with fewer triangles where they are flat.
+    """Points (n, 3), LPS mm, and triangles (m, 3) of the same surfaces, with fewer triangles where they are flat.
 
-    Nodes are taken out one by one (W. J. Schroeder and others 1992, doi:10.1145/142920.134010), as long as the errors
-    on the way, each a node's distance to the surface without it, add up to no more than ``off_mm``. Lines where three
-    surfaces meet, and edges, keep all their nodes; topology is kept.
+    Nodes are removed one by one (W. J. Schroeder and others 1992, doi:10.1145/142920.134010) while the sum of the
+    errors is at most ``off_mm``; the error of a step is the distance of the removed node to the new surface. Edges, and
+    lines where three surfaces meet, keep all their nodes. The topology does not change.
     """
     import pyvista
     from vtkmodules.vtkFiltersCore import vtkDecimatePro
@@ -71,9 +71,9 @@ def thinned(borders: Borders, off_mm: float) -> tuple[FloatArray, IntArray]:
 
 
 def labels_at(labels: LabelMap, borders: Borders, points_mm: FloatArray) -> IntArray:
-    """Label of the tissue whose border encloses each point (n, 3) LPS mm; 0 outside all.
+    """Label of the tissue whose surface encloses each point (n, 3) LPS mm; 0 outside all tissues.
 
-    Smoothing moves borders by a voxel or less: where all voxels around a point have one label, it is that.
+    Smoothing moves surfaces by at most a voxel. If all voxels around a point have the same label, that label is used.
     """
     import pyvista
     from vtkmodules.vtkFiltersModeling import vtkSelectEnclosedPoints
@@ -98,14 +98,14 @@ def labels_at(labels: LabelMap, borders: Borders, points_mm: FloatArray) -> IntA
 def with_volumes(
     points_mm: FloatArray, cells: IntArray, tissue: IntArray, volumes_mm3: dict[int, float], farthest_mm: float
 ) -> FloatArray:
-    """Nodes (n, 3) on the borders moved until each tissue encloses its volume, by label; mm, in any frame.
+    """Nodes (n, 3), mm, any frame, with those on the interfaces moved until each tissue has its volume (by label).
 
-    ``cells`` (m, 4) fill a box and ``tissue`` (m,) labels them; labels without a volume, such as that of air, get the
-    rest. A step moves nodes along the gradients of the volumes, by one factor for each label: the least sum over the
-    nodes of the distance squared, times the area of all tissues' borders around the node, that changes the volumes as
-    wanted, to first order. A smoothed thin cord gets wider by the same distance all around. Where a cell would lose
-    four fifths of its volume in a step, or turn over, its nodes move by half as much, and so on. A node moves no
-    farther than ``farthest_mm`` in each of three steps, even if volumes are still off then.
+    ``cells`` (m, 4) fill a box and ``tissue`` (m,) labels them; labels without a volume, such as air, take the rest.
+    A step moves the nodes along the gradients of the volumes, by one factor for each label. To first order it changes
+    the volumes as required with the smallest sum of squared distances, weighted by the area of all interfaces around
+    each node. A smoothed thin cord, for example, widens by the same distance all around. If a cell would be inverted or
+    lose four fifths of its volume in a step, the moves of its nodes are halved, repeatedly if needed. A node moves at
+    most ``farthest_mm`` in each of three steps, even if the volumes are not reached.
     """
     points = points_mm.copy()
     labels = list(volumes_mm3)
@@ -137,7 +137,7 @@ def with_volumes(
 
 
 def _without_turning(points: FloatArray, cells: IntArray, moves: FloatArray) -> FloatArray:
-    """The moves, halved around cells that they would turn over or all but flatten."""
+    """The moves, halved around cells that they would invert or nearly flatten."""
     moves = moves.copy()
     before = signed_volumes(points[cells])
     for _ in range(_HALVINGS):

@@ -216,7 +216,7 @@ def test_no_step_folds_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
         Imposed(np.zeros(assembler.size), np.array([assembler.own_equations]), np.array([-4.8])), Tolerance(),
         log=told.append,
     )  # fmt: skip
-    made = [float(line.rsplit(" ", 1)[1]) for line in told if "least det F" in line]
+    made = [float(line.rsplit(" ", 1)[1]) for line in told if "smallest det F" in line]
     assert min(tried) < 0.0
     assert min(made) > LEAST_VOLUME
     assert found is not None

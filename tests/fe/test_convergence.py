@@ -53,7 +53,9 @@ def test_no_limit_is_told_where_there_is_none() -> None:
     assert np.isnan(found.limit)
     assert np.isnan(extrapolate(h[1:], np.array([1.0, 1.1, 1.3])).limit)  # runs away: an order below 0.5
     for sizes in (h[:2], np.array([2.0, 1.9, 1.8])):
-        with pytest.raises(InputError, match=r"3 or more meshes, the coarsest 1\.5 times the size"):
+        with pytest.raises(
+            InputError, match=r"at least 3 meshes of different cell size, the coarsest at least 1\.5 times"
+        ):
             extrapolate(sizes, sizes)
 
 
@@ -97,7 +99,7 @@ def test_the_command(tmp_path: Path) -> None:
     out = tmp_path / "study"
     done = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
     assert done.exit_code == 0, done.output
-    assert "Size of the cells, mm" in done.output
+    assert "Cell sizes, mm" in done.output
     with (out / "convergence.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximum shear strain of fat, p50"]
@@ -115,7 +117,7 @@ def test_a_misspelt_set_or_region_is_refused_before_meshing(tmp_path: Path) -> N
 
     write_labels(tmp_path / "map.nii.gz", half_onion())
     for wrong, said in (
-        ({"material": "trebi"}, "the nearest is 'trebbi'"),
+        ({"material": "trebi"}, "did you mean 'trebbi'"),
         ({"region": "fatt"}, "No soft tissue 'fatt'"),
     ):
         with pytest.raises(InputError, match=said):

@@ -291,7 +291,7 @@ def test_an_febio_deck_has_only_words_that_febio_reads(tmp_path: Path, quadratic
 def test_a_law_that_a_solver_does_not_have_is_refused(tmp_path: Path) -> None:
     mesh, laws = slab(), {"skin": NeoHooke.of(0.1), "fat": Hencky.of(0.02, nu=0.49)}
     state = states_of(mesh, laws, "P1")[0]
-    with pytest.raises(InputError, match="no material law that is linear in logarithmic strain"):
+    with pytest.raises(InputError, match="no constitutive model that is linear in logarithmic strain"):
         write_calculix(tmp_path / "a.inp", mesh, laws, state)
     with pytest.raises(InputError, match="no FEBio deck is written for linear elastic"):
         write_febio(tmp_path / "a.feb", mesh, laws, state)

@@ -113,7 +113,7 @@ def test_the_command_tells_that_time_was_over(tmp_path: Path) -> None:
     given = [*GIVEN, "--out", str(tmp_path / "out"), "--limit-minutes", "0.00001"]
     ended = CliRunner().invoke(app, ["simulate", str(tmp_path / "dome.vtu"), *given])
     assert ended.exit_code == 1
-    assert "a: its time was over before the first equilibrium" in ended.output
+    assert "a: the time limit was reached before the first equilibrium" in ended.output
     assert "b was not tried" in ended.output
 
 
@@ -187,7 +187,7 @@ def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
     again = CliRunner().invoke(app, [*command, "--out", str(out.parent)])
     assert again.exit_code == 0, again.output
     log = (out / "log-a.txt").read_text().splitlines()
-    assert log[0] == "a: 100% of it was there from an earlier run"
+    assert log[0] == "a: resumed at 100% from an earlier run"
     assert not any(line.startswith("moved") for line in log)
     for load in ("a", "b", "c"):
         one, other = (meshio.read(folder / "luboz" / f"{load}.vtu") for folder in (tmp_path / "uncut", out.parent))
