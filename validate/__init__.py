@@ -1,6 +1,6 @@
 """Finite-element models compared with measured deformation: how large the difference is, where, and whether it counts.
 
-The public surface; a name is loaded when it is first used. All geometry is LPS mm in the reference (unloaded)
+Public interface; each name is loaded when it is first used. All geometry is LPS mm in the reference (unloaded)
 configuration unless a docstring says otherwise. Imports from `phantoms`, `fe` and `dvc`.
 """
 

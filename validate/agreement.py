@@ -14,7 +14,7 @@ from validate.mapping import MappedFields
 TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)
 """Lower ends of the bins of distance to bone, mm."""
 
-_FLAT, _LEAST = 1e-12, 10  # variance over mean square; cells, of which fewer give no row
+_FLAT, _LEAST = 1e-12, 10  # variance over mean square, below which a field is uniform; smallest number of cells
 _COPLANAR_MM, _INWARD_MM = 0.3, 1.0
 
 
@@ -132,8 +132,8 @@ class SkinDisplacement:
 def skin_on_plate(model: OnMesh, normal: FloatArray) -> IntArray:
     """Surface nodes of a model that are coplanar, across ``normal``, in the deformed configuration.
 
-    Of all such planes in the half of the model that faces the plate, the one with most nodes: tissue may bulge past a
-    small plate.
+    Of all such planes in the half of the model that faces the plate, the one with most nodes is chosen, since tissue
+    may bulge past a small plate.
     """
     outside = np.unique(outer_faces(model.mesh.cells))
     height = (model.mesh.points_mm + model.u_mm)[outside] @ normal
@@ -153,8 +153,8 @@ def skin_displacement(
     fields : MappedFields
         With the model ``name``; gives the volume change of the fat.
     model, measured : OnMesh, Deformation
-        Both relative to the bone, reference configuration, LPS mm. Skin on the plate is the model's surface that is
-        flat across ``normal`` when deformed.
+        Both relative to the bone, reference configuration, LPS mm. The skin on the plate is the part of the model's
+        surface that is flat across ``normal`` in the deformed configuration.
     normal : (3,)
         The plate's outward unit normal, LPS.
     """

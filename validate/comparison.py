@@ -1,4 +1,4 @@
-"""A measurement compared with finite-element models under one or several loads: figures, files, notebook, plots."""
+"""Comparison of a measurement with finite-element models under one or several loads: results, files and plots."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -41,22 +41,23 @@ class Comparison:
     Attributes
     ----------
     areas, overlaps, agreements, skin : tuple of Area, Overlap, Agreement, SkinDisplacement
-        Rows by load and model: area between volume-strain curves by tissue, location of clusters above thresholds,
+        Rows by load and model: area between strain-volume curves by tissue, location of clusters above thresholds,
         agreement cell by cell, displacement of the skin.
     curves : tuple of Curve
-        Volume-strain curves, measured and simulated.
+        Strain-volume curves, measured and simulated.
     ranking : Ranking
         Of the models, over all loads and under each.
     strains : (low, high)
         Range of maximum shear strain of the areas.
     coverage_ml : mapping of load to mapping
-        Volume of the mesh, of what each field defines of it, and of what is common to all.
+        Volume of the mesh, of the part in which each field is defined, and of the common part.
     verdict, verdicts : Verdict or None, mapping of load to Verdict or None
-        On the registrations and on slips of the models, None where nothing is known; and on each registration.
+        Verdict on the inputs (registrations, and input errors of the models; None if there is neither), and on each
+        registration.
     notes, warnings : tuple of str
-        Limitations of this comparison, and what looks wrong about a model.
+        Limitations of this comparison, and possible input errors of the models.
     loads : tuple of LoadComparison
-        Fields, by load; empty for a comparison that was read back.
+        Fields, by load; empty for a comparison that was read from files.
     """
 
     areas: tuple[Area, ...]
@@ -74,17 +75,17 @@ class Comparison:
     loads: tuple[LoadComparison, ...] = ()
 
     def summary(self) -> list[str]:
-        """Verdict, areas, and which differences are significant, a line each."""
+        """Verdict, areas, and significant differences, one line each."""
         lines = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}"]
         for load in self.coverage_ml:
             areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL)}
             nothing = areas.pop(NOTHING)
             levelled = {name: a for name, a in areas.items() if name.endswith(LEVELLED)}
             ranked = sorted((a for name, a in areas.items() if name not in levelled), key=lambda a: a.best_ml)
-            lines.append(f"{load}: area between curves, mL, best first: {_listed(ranked, nothing)}")
+            lines.append(f"{load}: area between strain-volume curves, mL, best first: {_listed(ranked, nothing)}")
             for name, area in levelled.items():
                 before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
-                lines.append(f"{load}: {name} {area.ml:.2f} as measured, {before:.2f} before levelling")
+                lines.append(f"{load}: {name} {area.ml:.2f} as measured; {before:.2f} without levelling")
         if len(self.coverage_ml) > 1 and self.ranking.areas:
             lines.append(f"All loads: {_listed(self.ranking.areas, self.ranking.nothing)}")
         return [*lines, *self.ranking.statements, *self.notes]
@@ -93,60 +94,61 @@ class Comparison:
         return "\n".join(self.summary())
 
     def _repr_html_(self) -> str:
-        """For a notebook: the answer, the areas of all soft tissue, and the curves."""
+        """For a notebook: the best match, the areas of all soft tissue, and the curves."""
         loads = list(self.coverage_ml)
         head = ("model", "rank", *loads, *(["all loads"] if len(loads) > 1 else []))
         rows = tuple(row[: len(head)] for row in area_rows(self.areas, self.ranking, loads))
         low, high = self.strains
         interval = " (95 % interval)" if any(np.isfinite(area.low_ml) for area in self.areas) else ""
-        title = f"Area between volume-strain curves, maximum shear strain {low:g} to {high:g}, mL{interval}"
-        picture = Picture("Volume-strain curves", "", png_bytes(self.plot()))
+        title = f"Area between strain-volume curves, maximum shear strain {low:g} to {high:g}, mL{interval}"
+        picture = Picture("Strain-volume curves", "", png_bytes(self.plot()))
         words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}.", *self.verdict.reasons]
         return notebook_html(self._answer(), picture, Table(title, head, rows), notes=words)
 
     def _answer(self) -> str:
-        """One sentence: the best match, or for a single model its area."""
+        """One sentence: the best match, or the area of a single model."""
         if self.ranking.statements:
             return self.ranking.statements[0]
         ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
         best = min(ranked, key=lambda a: a.best_ml)
         nothing = {a.load: a for a in (*self.areas, self.ranking.nothing) if (a.model, a.tissue) == (NOTHING, ALL)}
-        worse = (
-            ", no nearer to the measurement than no deformation at all" if no_nearer([best], nothing[best.load]) else ""
+        worse = ", no better than a model without deformation" if no_nearer([best], nothing[best.load]) else ""
+        return (
+            f"{best.model}: area between strain-volume curves {shown(best)} mL ({best.load}), normalised "
+            f"{best.share:.1%}{worse}."
         )
-        return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}{worse}."
 
     def plot(self, kind: Literal["curves", "areas"] = "curves", *, tissue: str = ALL) -> Figure:
-        """Draw volume-strain curves, a panel for each load, or the areas between them with their 95 % intervals.
+        """Draw strain-volume curves, a panel for each load, or the areas between them with their 95 % intervals.
 
         Raises
         ------
         InputError
-            If there is no such kind of plot, or no such tissue.
+            If the kind of plot or the tissue is unknown.
         """
         tissues = dict.fromkeys(c.tissue for c in self.curves)
         if tissue not in tissues:
-            raise InputError(f"No tissue '{tissue}' is compared; there are {', '.join(tissues)}.")
+            raise InputError(f"The tissue '{tissue}' is not compared; compared tissues are {', '.join(tissues)}.")
         if kind == "curves":
             return figures.curves_by_load([c for c in self.curves if c.tissue == tissue], self.strains)
         if kind == "areas":
             return figures.areas_by_load([a for a in self.areas if a.tissue == tissue and a.model != NOTHING])
-        raise InputError(f"A comparison has plots of 'curves' and 'areas', none of '{kind}'.")
+        raise InputError(f"Unknown plot '{kind}'; available are 'curves' and 'areas'.")
 
     def write(
         self, folder: Path | str, *, record: Mapping[str, object] | None = None, methods: Sequence[str] = (),
         on_image: bool = False, each: Each = map,
     ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:  # fmt: skip
-        """Write tables, fields, pictures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
+        """Write tables, fields, figures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
-        It gives the sections of the report, and the closing ones.
+        Returns the sections of the report, and its closing sections.
 
         Parameters
         ----------
         folder : path
             Gets ``report.html``, ``comparison.json``, tables, and a folder for each load.
         record : mapping, optional
-            Provenance, kept in the JSON files; by default the range of the areas.
+            Provenance for the JSON files; by default the range of strain.
         methods : sequence of str
             Paragraphs for a methods section.
         on_image : bool
@@ -157,10 +159,10 @@ class Comparison:
         Raises
         ------
         InputError, OutputError
-            If the comparison was read back, without its fields; if the folder cannot be written.
+            If the comparison was read from files and so has no fields; if the folder cannot be written.
         """
         if not self.loads:
-            raise InputError("A comparison that was read back has no fields to write; copy its folder instead.")
+            raise InputError("A comparison that was read from files has no fields to write; copy its folder instead.")
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         tables.remove_earlier(target, list(self.coverage_ml))
@@ -187,7 +189,7 @@ class Comparison:
             "verdict_by_load": {load: _plain(verdict) for load, verdict in self.verdicts.items()},
         }  # fmt: skip
         write_json(target / tables.RECORD, own | about)
-        closing, title = closing_sections(self.loads[0].criteria.thresholds, methods), "Models against the measurement"
+        closing, title = closing_sections(self.loads[0].criteria.thresholds, methods), "Models and measurement"
         write_report(target / "report.html", title, self.verdict, sections, closing, record_lines(about))
         return tuple(sections), tuple(closing)
 
@@ -198,7 +200,7 @@ class Comparison:
         Raises
         ------
         InputError
-            If the folder holds no comparison.
+            If the folder does not contain a comparison.
         """
         place = Path(folder)
         areas, overlaps, agreements, skin = tables.read_tables(place)
@@ -211,7 +213,7 @@ class Comparison:
             ranking = Ranking(tuple(totals), nothing, tuple(content["told_apart"]), pairs)
             coverage, verdict, notes = content["coverage_ml"], _verdict(content["verdict"]), tuple(content["notes"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{place / tables.RECORD} is no record of a comparison ({error}).") from error
+            raise InputError(f"{place / tables.RECORD} is not a valid record of a comparison ({error}).") from error
         by_load, curves = tuple(a for a in areas if a.load != ALL_LOADS), tables.read_curves(place)
         return cls(
             by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes
@@ -221,7 +223,7 @@ class Comparison:
 def _write_load(
     one: LoadComparison, folder: Path, drawn: Callable[..., Drawn], about: Mapping[str, object], on_image: bool
 ) -> tuple[list[Section], Strip]:
-    """Write the folder of one load; return its sections of the report, and its part of the first picture."""
+    """Write the folder of one load; return its sections of the report, and its part of the first figure."""
     pictures, viewer, strip = drawn(one)
     with whole_folder(folder / one.load) as part:
         tables.write_fields(part / "fields.vtu", one)
@@ -248,35 +250,36 @@ def compare(
     labels, bones : LabelMap, sequence of str
         Tissues of the unloaded image, and which of them are bone.
     mesh : TetMesh, optional
-        Where fields are compared; by default the mesh of each load's first model.
+        Mesh on which fields are compared; by default the mesh of the first model of each load.
     criteria : Criteria, optional
         Range of strains, thresholds, and seed of the draws.
     notes : sequence of str
-        What else is known about the models.
+        Further notes on the models.
     warnings : sequence of str, optional
-        What `check_models` gave; by default the models are checked here.
+        Result of `check_models`; by default the models are checked here.
     progress : callable
-        Gets the fraction done.
+        Called with the fraction done.
     each : callable
-        `map`, or that of `dvc.worker.side_by_side`, which computes several loads at once, in processes of their own.
+        `map`, or that of `dvc.worker.side_by_side`, which computes several loads at the same time in separate
+        processes.
 
     Returns
     -------
     Comparison
-        ``areas`` (mL) between the volume-strain curves, ``ranking`` over all loads, ``overlaps``, ``agreements``, the
+        ``areas`` (mL) between the strain-volume curves, ``ranking`` over all loads, ``overlaps``, ``agreements``, the
         ``verdict`` and more, as tables of rows; `Comparison.write` makes the report.
 
     Raises
     ------
     InputError, GeometryError
-        If two loads or two models of one share a name, the label map lacks a bone, or a model does not lie in the
-        imaged tissue (a slip of unit, frame or configuration); see `check_models`.
+        If two loads, or two models of one load, have the same name; if the label map lacks a bone; or if a model does
+        not lie in the imaged tissue (wrong unit, frame or configuration). See `check_models`.
     """
     by = Criteria() if criteria is None else criteria
     odd = list(check_models(cases, labels, bones, each=each) if warnings is None else warnings)
     loads: list[LoadComparison] = []
     for one in each(partial(compare_load, labels=labels, bones=bones, mesh=mesh, criteria=by), cases):
-        loads.append(replace(one, labels=labels))  # one label map for all, where they come from processes
+        loads.append(replace(one, labels=labels))  # one label map for all; loads from other processes have copies
         odd += [f"{one.load}: {slip}" for name in one.fields.models if (slip := displacement_slip(one.fields, name))]
         if progress is not None:
             progress(len(loads) / len(cases))
@@ -294,20 +297,20 @@ def compare(
 
 
 def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] = ()) -> Verdict | None:
-    """The verdict on the inputs: the worst of the registrations' (by load) and of warnings on models, None without any.
+    """The verdict on the inputs: the worst of the registrations' (by load) and of warnings on models; None without any.
 
-    It lists all reasons below trust, the worst first.
+    It lists the reasons of all verdicts below Trust, the worst first.
     """
     verdicts = [Verdict("caution", tuple(warnings))] if warnings else []
     for load, verdict in measured.items():
         if verdict is not None:
-            what = "is not to be trusted" if verdict.level == "distrust" else "is to be used with care"
-            reasons = tuple(f"{load}: its registration {what}: {reason}" for reason in verdict.reasons)
+            reasons = tuple(f"{load}, registration ({verdict.words}): {reason}" for reason in verdict.reasons)
             verdicts.append(Verdict(verdict.level, () if verdict.level == "trust" else reasons))
     if not verdicts:
         return None
     distrust, caution = ([r for v in verdicts if v.level == level for r in v.reasons] for level in LEVELS[:0:-1])
-    sound = f"The measurement: {len(verdicts)} registrations are sound. The models are compared below."
+    registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
+    sound = f"{registrations} can be trusted. The models are compared below."
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 
@@ -317,32 +320,32 @@ def _doubts(verdict: Verdict | None) -> tuple[str, ...]:
 
 
 def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
-    """What the measurement of each load lacks, and which models cover little of the mesh, in sentences."""
+    """Limitations of each measurement, and models that cover little of the mesh, as sentences."""
     notes = []
     for one in loads:
         load, error, volumes = one.load, one.case.error, one.fields.coverage()
         if one.case.aligned_on == "none":
-            what = "the bone's motion was not removed from this measurement: displacements are not the tissue's alone."
+            what = "the rigid motion of the bone was not removed from this measurement, so displacements include it."
             notes.append(f"{load}: {what}")
         if error is not None and np.isnan(error.widening):
-            what = "the coverage of its intervals is unknown (an error model of one subject): they are not widened."
+            what = "the error model is from one subject, so the coverage of its intervals is unknown (not widened)."
             notes.append(f"{load}: {what}")
         notes += [
-            f"{load}: {name} covers {volumes[name] / volumes['mesh']:.0%} of the mesh, and all models are scored on "
-            "the tissue that every one covers."
+            f"{load}: {name} covers only {volumes[name] / volumes['mesh']:.0%} of the mesh. All models are compared on "
+            "the tissue that every model covers."
             for name in one.fields.models
             if volumes[name] < _COVERED * volumes["mesh"]
         ]
     if unknown := ", ".join(one.load for one in loads if one.case.error is None):
-        what = "the measurement uncertainty is unknown (the measurement has no error model)"
-        notes.append(f"{unknown}: {what}: no difference counts as significant.")
+        what = "the measurement has no error model, so its uncertainty is unknown"
+        notes.append(f"{unknown}: {what} and no difference is significant.")
     return notes
 
 
 def _listed(areas: Sequence[Area], nothing: Area) -> str:
     worse = ", ".join(no_nearer(areas, nothing))
     listed = ", ".join(f"{a.model} {shown(a)}" for a in areas)
-    return listed + (f"; no nearer than {NOTHING} ({shown(nothing)}): {worse}" if worse else "")
+    return listed + (f"; no better than {NOTHING} ({shown(nothing)}): {worse}" if worse else "")
 
 
 def _plain(verdict: Verdict | None) -> dict[str, object] | None:

@@ -1,4 +1,4 @@
-"""Strain intensity: volume-strain curves, and the area between two of them.
+"""Strain intensity: strain-volume curves, and the area between two of them.
 
 V(s) is the volume of the cells whose maximum shear strain exceeds s: an exact step function, without bins. The metric
 is A = integral of |V_FE - V_DVC| ds over a range of strain, in mL: the area validation metric (Ferson, Oberkampf and
@@ -21,21 +21,21 @@ RANGE = (0.2, 0.5)
 """Range of maximum shear strain over which curves are compared by default."""
 
 MOST_STRAIN = 3.0
-"""Upper end of a range; beyond, it is taken to be in percent."""
+"""Largest upper end of a range; larger values are probably in percent."""
 
 DRAWS = 200
-"""Truths drawn from the error model for the curves and areas of a load."""
+"""Number of true fields drawn from the error model for the curves and areas of a load."""
 
 _GRID = 301
 _SURE = 0.975
-_EVERY = 4  # of so many draws one is made a perfect model
+_EVERY = 4  # every so many draws, one serves as a perfect model
 
 
 def check_range(strains: tuple[float, float]) -> None:
-    """Refuse with an `InputError` a range of maximum shear strain that does not rise from 0 or more to 3 or less."""
+    """InputError unless a range of maximum shear strain increases and lies within 0 to 3."""
     if not 0.0 <= strains[0] < strains[1] <= MOST_STRAIN:
         raise InputError(
-            f"The range of strain must rise from 0 or more to {MOST_STRAIN:g} or less (no percent); got "
+            f"The range of strain must increase and lie within 0 to {MOST_STRAIN:g} (not in percent); got "
             f"{strains[0]:g} to {strains[1]:g}."
         )
 
@@ -43,7 +43,7 @@ def check_range(strains: tuple[float, float]) -> None:
 def area_between(
     first: FloatArray, second: FloatArray, volumes_ml: FloatArray, strains: tuple[float, float] = RANGE
 ) -> float:
-    """Area (mL) between the volume-strain curves of two fields (n,) on the same cells; exact.
+    """Area (mL) between the strain-volume curves of two fields (n,) on the same cells; exact.
 
     Examples
     --------
@@ -62,16 +62,16 @@ def area_between(
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Area between a model's volume-strain curve and the measured one; a row of areas.csv.
+    """Area between a model's strain-volume curve and the measured one; a row of areas.csv.
 
     Attributes
     ----------
     ml, share : float
-        As measured, with the measurement's bias and noise; and normalised by the tissue's volume and the width of the
-        range.
+        As measured, with the bias and noise of the measurement; and normalised by the tissue's volume and the width of
+        the range.
     estimate_ml : float
-        Median of the areas to the truths drawn, which removes the measurement's bias. NaN, as are those below, if the
-        measurement uncertainty is unknown.
+        Median of the areas to the drawn true fields, which removes the bias of the measurement. This and the following
+        attributes are NaN if the measurement uncertainty is unknown.
     low_ml, high_ml : float
         95 % interval from the measurement uncertainty.
     floor_ml : float
@@ -90,27 +90,27 @@ class Area:
 
     @property
     def levelled(self) -> bool:
-        """Whether it is of a levelled model, whose areas are of another kind: no bias is removed from them."""
+        """Whether the model is levelled; no bias is removed from areas of levelled models."""
         return self.model.endswith(LEVELLED)
 
     @property
     def best_ml(self) -> float:
-        """The estimate if there is one, else the area as measured."""
+        """The estimate if there is one, otherwise the area as measured."""
         return self.ml if np.isnan(self.estimate_ml) else self.estimate_ml
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """Band of the true volume-strain curve, and the areas to the truths drawn.
+    """Band of the true strain-volume curve, and the areas to the drawn true fields.
 
     Attributes
     ----------
     strains, low_ml, high_ml : (k,)
         95 % band of the true V.
     areas_ml : mapping of model to (draws,)
-        Area to each truth drawn.
+        Area to each drawn true field.
     floor_ml : float
-        Area that a perfect model would get: the median area between a truth drawn, narrowed as in `bands`, and the
+        Area that a perfect model would get: the median area between a drawn true field, narrowed as in `bands`, and the
         next one.
     widening : float
         Factor on intervals of draws; see `dvc.trust.error_model.ErrorTable`.
@@ -126,7 +126,7 @@ class Band:
     def interval(self, model: str) -> tuple[float, float, float, float]:
         """Estimate of a model's area, its 95 % interval, and the floor, mL.
 
-        An area is not negative, and noise alone increases it: an interval that reaches the floor begins at 0.
+        Noise alone gives an area above zero, so an interval that reaches the floor begins at 0.
         """
         low, middle, high = (float(v[0]) for v in widened(self.areas_ml[model][:, None], self.widening))
         return middle, 0.0 if low <= self.floor_ml else low, high, self.floor_ml
@@ -143,24 +143,24 @@ def bands(
     tissues: Mapping[str, np.ndarray], widening: float, narrowed: Callable[[FloatArray], FloatArray],
     strains: tuple[float, float] = RANGE,
 ) -> dict[str, Band]:  # fmt: skip
-    """Bands of the true curve by tissue, from truths drawn for all cells at once.
+    """Bands of the true curve by tissue, from true fields drawn for all cells at once.
 
     Parameters
     ----------
     truths : iterable of (n,)
-        Maximum shear strain of each truth drawn, in the cells; see `dvc.trust.error_model.TruthDraws`.
+        Maximum shear strain of each drawn true field, in the cells; see `dvc.trust.error_model.TruthDraws`.
     models, tissues : mapping of name to (n,)
-        Maximum shear strain of each model in the cells, and which of the cells belong to each tissue.
+        Maximum shear strain of each model in the cells, and the cells of each tissue.
     narrowed : callable
-        Narrows a truth drawn (n,) to the spread of a perfect model: `dvc.trust.error_model.TruthDraws.narrowed`.
+        Narrows a drawn true field (n,) to the spread of a perfect model: `dvc.trust.error_model.TruthDraws.narrowed`.
     strains : (low, high)
         Range of the areas; the band begins at 0 and ends at one and a half times its upper end.
 
     Notes
     -----
-    A truth drawn is the measured field, which carries noise, minus drawn noise. Where the strain varies by little more
-    than the noise, truths drawn have a wider distribution than the truth, and similar ones: the area between two of
-    them would be too small for a perfect model, whose curve is steeper.
+    A drawn true field is the measured field, which contains noise, minus drawn noise. If the strain varies by little
+    more than the noise, the drawn fields have wider distributions than the true field, all similar to each other. The
+    area between two of them would then be too small for a perfect model, whose curve is steeper.
     """
     low, high = strains
     inner, outer = np.linspace(low, high, _GRID), np.linspace(0.0, 1.5 * high, _GRID)
@@ -181,7 +181,7 @@ def bands(
     for name, inside in tissues.items():
         on_outer, on_inner = np.split(np.array([of[name] for of in drawn]), [_GRID], axis=1)
         least, _, most = widened(on_outer, widening)
-        following = on_inner[1::_EVERY]  # the truths drawn after those that were made perfect models
+        following = on_inner[1::_EVERY]  # the draws after those that serve as perfect models
         floor = np.median(areas(np.array([of[name] for of in perfect])[: len(following)], following))
         of_models = {model: areas(simulated[name], on_inner) for model, simulated in curves.items()}
         most = np.minimum(most, volumes_ml[inside].sum())

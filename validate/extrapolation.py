@@ -1,7 +1,7 @@
-"""A model's displacement extrapolated over a whole image, for forward-model comparison (levelling).
+"""Displacement of a model extrapolated over a whole image, for forward-model comparison (levelling).
 
-A measurement smooths and a model does not. Levelling simulates the measurement on the model's displacement: it warps
-the unloaded image, fresh noise is added, and the pair is registered as the scans were.
+A measurement smooths and a model does not. Levelling simulates the measurement of a model: its displacement warps the
+unloaded image, fresh noise is added, and the pair is registered like the scans.
 """
 
 from itertools import product
@@ -23,8 +23,8 @@ _SMOOTH_MM, _ROUNDS, _MENDING, _LEAST_VOLUME = 2.0, 40, 12, 0.1
 def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
     """A model's displacement at every voxel of the unloaded image's grid; ``bone`` (ni, nj, nk) bool on the same grid.
 
-    It is as simulated in the model's mesh, zero in bone, and smoothly extrapolated elsewhere. A model in whose mesh no
-    voxel lies is refused with an `InputError`.
+    It is as simulated inside the model's mesh, zero in bone, and smoothly extrapolated elsewhere. InputError if no
+    voxel lies in the mesh.
     """
     at = grid.indices_of(np.array(list(product(*model.mesh.bounds_mm.T))))
     ends = np.clip([np.floor(at.min(axis=0)), np.ceil(at.max(axis=0)) + 1], 0, grid.shape).astype(int)
@@ -34,7 +34,7 @@ def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacem
     u[box] = evaluate_on_grid(model, grid, box)[0]
     inside = np.isfinite(u).all(axis=-1)
     if not inside.any():
-        raise InputError("No voxel of the image lies in the model's mesh.")
+        raise InputError("No voxel of the image lies in the mesh of the model. Check unit and frame of the model.")
     u[bone & ~inside] = 0.0
     known = inside | bone
     nearest = distance_transform_edt(~known, sampling=grid.spacing_mm, return_distances=False, return_indices=True)
@@ -51,7 +51,8 @@ def _smoothed(grid: Grid, u: FloatArray) -> FloatArray:
 def _unfolded(grid: Grid, u: FloatArray) -> SampledDisplacement:
     """The displacement, smoothed repeatedly around the voxels at which its spline folds.
 
-    A model is linear in each cell; where a cell is nearly flat the spline through the voxels overshoots.
+    The displacement of a model is linear in each cell, and the spline through the voxels overshoots at nearly flat
+    cells.
     """
     width = _SMOOTH_MM / grid.spacing_mm
     inner = np.zeros(grid.shape, dtype=bool)

@@ -1,7 +1,7 @@
-"""Results of any finite-element code as a `Deformation`, whatever its unit and frame.
+"""Results of any finite-element code as a `Deformation`, in any unit and frame.
 
 A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, FEBio .xplt), or a mesh (also Abaqus
-.inp, ANSYS .cdb) and a table of its nodes' displacements (.csv: node number, and three components).
+.inp, ANSYS .cdb) and a table of nodal displacements (.csv: node number, and three components).
 """
 
 import csv
@@ -29,20 +29,20 @@ _COMPONENTS = (
     ("u_x", "u_y", "u_z"), ("u.x", "u.y", "u.z"), ("u.u1", "u.u2", "u.u3"), ("disp_x", "disp_y", "disp_z"),
     ("dx", "dy", "dz"),
 )  # fmt: skip
-_SCALES = {1.0: "this unit", 1e3: "metres (--model-unit m)"}
-_TURNS = {(1.0, 1.0, 1.0): "this frame", (-1.0, -1.0, 1.0): "the other of LPS and RAS (--model-frame)"}
-_INSIDE = 0.5  # fraction of a mesh's nodes that has to lie in the image
+_SCALES = {1.0: "this unit", 1e3: "the unit m"}
+_TURNS = {(1.0, 1.0, 1.0): "this frame", (-1.0, -1.0, 1.0): "the other frame (LPS or RAS)"}
+_INSIDE = 0.5  # fraction of a mesh's nodes that must lie in the image
 _MOST_MM = 200.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeResult:
-    """A model's result for one load, on linear tetrahedra in the reference (unloaded) configuration, LPS mm.
+    """Result of a model for one load, on linear tetrahedra in the reference (unloaded) configuration, LPS mm.
 
     Attributes
     ----------
     name, path : str, path
-        Of the model, as it stands in tables; and of its file, which messages name.
+        Name of the model in tables; and its file, for messages.
     deformation : OnMesh
         Displacement (n, 3) of the mesh's nodes relative to the bone, LPS mm, in the frame of the unloaded image.
     """
@@ -54,9 +54,9 @@ class FeResult:
     @classmethod
     @checked
     def of(cls, name: str, deformation: OnMesh) -> "FeResult":
-        """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say.
+        """The result of a model in memory, such as ``simulation.deformation("Load1")``, with its name in tables.
 
-        Another class than `fe.Simulation.deformation` gives is an `InputError`.
+        InputError if ``deformation`` is not of the class that `fe.Simulation.deformation` returns.
         """
         return cls(name, Path(name), deformation)
 
@@ -70,21 +70,21 @@ def read_result(
     name: str, path: Path | str, *, mesh: Path | str | None = None, unit: str = "mm", frame: str = "LPS",
     to_image: FloatArray | None = None,
 ) -> FeResult:  # fmt: skip
-    """Read a result of any code for one load; displacement is relative to the bone, which does not move.
+    """Read the result of any code for one load; displacement is relative to the bone, which does not move.
 
     Parameters
     ----------
     name : str
-        Of the model, as it stands in tables.
+        Name of the model in tables.
     path, mesh : path
         One file with mesh and displacement: VTU, VTK, Gmsh .msh, CalculiX .frd, FEBio .xplt, with an array of three
-        components at the nodes called displacement (or displacement_mm, displacements, disp, u). Or a table (.csv)
-        of nodal displacements and, as ``mesh``, the mesh of its nodes: these formats, Abaqus .inp, ANSYS .cdb. The
-        table has a head, commas, and columns in any order and case: the node's number in the mesh file (node, node
-        label, node number, node_id, nodeid, id), and three components along x, y, z of the frame (ux, uy, uz; or in
-        this manner ux_mm, u1, u-u1, u_x, u.x, u.u1, disp_x, dx). Other columns are not read.
+        components at the nodes named displacement (or displacement_mm, displacements, disp, u). Or a table (.csv) of
+        nodal displacements and, as ``mesh``, the mesh of its nodes: these formats, Abaqus .inp, ANSYS .cdb. The table
+        has a header, commas, and columns in any order and case: the node number in the mesh file (node, node label,
+        node number, node_id, nodeid, id), and three components along x, y, z of the frame (ux, uy, uz; likewise ux_mm,
+        u1, u-u1, u_x, u.x, u.u1, disp_x, dx). Other columns are ignored.
     unit, frame : {"mm", "m"}, {"LPS", "RAS"}
-        Of coordinates and displacements, whatever the columns are called. Coordinates are those of the unloaded mesh.
+        Of coordinates and displacements, whatever the names of the columns. Coordinates are those of the unloaded mesh.
     to_image : (4, 4), optional
         Rigid map of the model's frame to the image's, LPS mm, applied after unit and frame; it also rotates the
         displacement.
@@ -92,14 +92,14 @@ def read_result(
     Raises
     ------
     InputError
-        If there is no displacement, a node has none, or it is not that of a body part under load.
+        If there is no displacement, it is missing at a node, or it is implausibly large for tissue.
     ImageFileError, GeometryError
         As `dvc.io.meshes.read.read_mesh`.
     """
     place = Path(path)
     is_table = place.suffix.lower() == ".csv"
     if is_table and mesh is None:
-        raise InputError(f"{place}: a table of displacements needs the mesh of its nodes (--model-mesh).")
+        raise InputError(f"{place}: a table of displacements also needs the mesh of its nodes; give the mesh file.")
     source = read_mesh((is_table and mesh) or place, unit=unit, frame=frame)
     u = (_from_table if is_table else _beside_mesh)(place, source) * MM_PER_UNIT[unit] * TO_LPS[frame]
     tets, carry = linear_tetrahedra(source)
@@ -107,16 +107,16 @@ def read_result(
     missing = used[~np.isfinite(u[used]).all(axis=1)]
     if len(missing):
         raise InputError(
-            f"{place}: {len(missing)} of {len(used)} nodes have no displacement, first node "
-            f"{source.node_ids[missing[0]]}. Export all nodes of the tissue."
+            f"{place}: {len(missing)} of {len(used)} nodes have no displacement (the first is node "
+            f"{source.node_ids[missing[0]]}). Export all nodes of the tissue."
         )
     rigid = _rigid(np.eye(4) if to_image is None else to_image)
     moved = np.asarray(carry @ np.nan_to_num(u)) @ rigid.matrix.T
     largest = float(np.linalg.norm(moved, axis=1).max())
     if not 0.0 < largest < _MOST_MM:
         raise InputError(
-            f"{place}: the largest displacement is {largest:.3g} mm, which is implausible for tissue under a plate. Is "
-            "the unit right, and the load step the last one?"
+            f"{place}: the largest displacement is {largest:.3g} mm, which is implausible for tissue under a plate. "
+            "Check the unit, and that the last load step was exported."
         )
     names = _names_of_regions(place)
     regions = {names.get(region, region): cells for region, cells in tets.regions.items()}
@@ -125,7 +125,7 @@ def read_result(
 
 
 def _names_of_regions(place: Path) -> dict[str, str]:
-    """Names of the numbers in the array ``region``, from the record beside one of our own files."""
+    """Names of the numbers in the array ``region``, from the record next to a file that mrstrain wrote."""
     tables = ((place.with_name("simulation.json"), "region_numbers_in_vtu"), (place.with_suffix(".json"), "regions"))
     for file, key in tables:
         try:
@@ -142,31 +142,31 @@ def _rigid(matrix: FloatArray) -> Affine:
     turn = affine[:3, :3] if affine.shape == (4, 4) else np.zeros((3, 3))
     proper = np.abs(turn.T @ turn - np.eye(3)).max() < 1e-4 and np.linalg.det(turn) > 0.0
     if not (proper and np.allclose(affine[3], [0.0, 0.0, 0.0, 1.0])):
-        raise InputError("The map to the image must be a 4 x 4 matrix of a rotation and a translation in mm.")
+        raise InputError("The map to the image (to_image) must be a 4 x 4 matrix of a rotation and a translation, mm.")
     return Affine(turn, affine[:3, 3])
 
 
 def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
-    """Displacement (n, 3) in the file's own unit and frame."""
+    """Displacement (n, 3) in the unit and frame of the file."""
     if place.suffix.lower() in (".inp", ".cdb"):
-        raise InputError(f"{place} holds a mesh and no result; give the table of its nodal displacements (.csv).")
+        raise InputError(f"{place} contains a mesh but no result; give the table of its nodal displacements (.csv).")
     if place.suffix.lower() == ".frd" and not source.at_nodes:
-        raise InputError(f"{place} has no displacements: write them with *NODE FILE, U.")
+        raise InputError(f"{place} has no displacements; write them with *NODE FILE, U in CalculiX.")
     if place.suffix.lower() == ".msh" and (np.diff(source.node_ids) <= 0).any():
         raise InputError(
-            f"{place}: its nodes do not stand in the order of their numbers, so that displacements may belong to "
-            "others. Write it as VTU."
+            f"{place}: the nodes are not in the order of their numbers, so displacements may be assigned to wrong "
+            "nodes. Write the result as VTU."
         )
     known = {name.casefold(): name for name in source.at_nodes}
     name = next((known[wanted] for wanted in _NAMES if wanted in known), None)
     if name is None:
         raise InputError(
-            f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}. Call it "
-            f"{_NAMES[1]!r}, in the unit of the coordinates."
+            f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}. Name "
+            f"the array {_NAMES[1]!r}; its unit must be that of the coordinates."
         )
     values = source.at_nodes[name]
     if values.shape != source.points_mm.shape:
-        raise InputError(f"{place}: its array '{name}' has shape {values.shape}, not three per node.")
+        raise InputError(f"{place}: the array '{name}' has shape {values.shape}; three components per node are needed.")
     return values
 
 
@@ -175,38 +175,38 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
         with place.open(newline="", encoding="utf-8-sig") as file:
             head, *rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)] or [[]]
     except (OSError, ValueError) as error:
-        raise InputError(f"{place}: no readable table ({error}).") from error
+        raise InputError(f"{place}: the table cannot be read ({error}).") from error
     named = [cell.strip(" '\"").casefold() for cell in head]
     node = next((n for n in _NODE_COLUMNS if n in named), None)
     parts = next((c for c in _COMPONENTS if set(c) <= set(named)), None)
     if node is None or parts is None:
         raise InputError(
-            f"{place}: a table of displacements has a column 'node' and three such as ux, uy, uz, with commas "
-            f"between; it has {', '.join(head)}."
+            f"{place}: a table of displacements needs a column 'node' and three columns such as ux, uy, uz, separated "
+            f"by commas; its columns are {', '.join(head)}."
         )
     columns = [named.index(c) for c in (node, *parts)]
     try:
         numbers = np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 4)
     except (ValueError, IndexError) as error:
-        raise InputError(f"{place}: a row is no node and three numbers ({error}).") from error
+        raise InputError(f"{place}: a row does not have a node and three numbers ({error}).") from error
     index = {int(n): i for i, n in enumerate(source.node_ids)}
     ids = numbers[:, 0].astype(np.int64)
     unknown = [int(n) for n in ids if int(n) not in index]
     if unknown or len(np.unique(ids)) < len(ids):
         what = f"node {unknown[0]}, which {source.path.name} does not have" if unknown else "a node twice"
-        raise InputError(f"{place} has {what}: table and mesh do not belong together.")
+        raise InputError(f"{place} has {what}; table and mesh do not match.")
     u = np.full((len(source.node_ids), 3), np.nan)
     u[[index[int(n)] for n in ids]] = numbers[:, 1:]
     return u
 
 
 def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
-    """Refuse a mesh that does not lie in the image.
+    """Check that a mesh lies in the image.
 
     Raises
     ------
     GeometryError
-        With both boxes, and with what would bring the model there, if a unit or a frame does.
+        If it does not; with both bounding boxes, and with the unit or frame that would fit, if there is one.
     """
 
     def lies_in(scale: float, signs: tuple[float, ...]) -> bool:
@@ -215,7 +215,11 @@ def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
     if lies_in(1.0, (1.0, 1.0, 1.0)):
         return
     fitting = [(size, frame) for (a, size), (b, frame) in product(_SCALES.items(), _TURNS.items()) if lies_in(a, b)]
-    hint = f"It would with {' and '.join(fitting[0])}" if fitting else "Give the map to the image's frame (--to-image)"
+    hint = (
+        f"It would fit with {' and '.join(fitting[0])}; check the unit and frame of the model"
+        if fitting
+        else "Give the rigid map to the frame of the image (to_image)"
+    )
     raise GeometryError(
         f"{path} does not lie in the image. Model: {box_told(*mesh.bounds_mm)}; image: {box_told(*grid.bounds_mm())} "
         f"(LPS mm). {hint}."

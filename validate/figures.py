@@ -20,17 +20,17 @@ _POINTS, _COLUMNS, _BINS, _BAND = 601, 3, 60, "#b8bfc9"
 
 
 def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence[str]) -> bytes:
-    """Volume of tissue above each maximum shear strain: measured (black) and models, in the same cells.
+    """Volume of tissue in which the maximum shear strain exceeds a value: measured (black) and models, same cells.
 
-    The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are taken between
-    the dotted lines.
+    The grey band contains the true curve in 95 % of cases, according to the error model of the measurement. Areas are
+    computed between the dotted lines.
     """
     curves = curves_of(one, np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS))
     return png_bytes(_curves([c for c in curves if c.tissue in tissues], "tissue", one.criteria.strains, colours))
 
 
 def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], colours: Sequence[str]) -> Figure:
-    """Curves, a panel for each load or tissue."""
+    """Curves, one panel for each load or tissue."""
     by_panel: dict[str, dict[str, Curve]] = {}
     for curve in curves:
         by_panel.setdefault(getattr(curve, by), {})[curve.field] = curve
@@ -39,14 +39,14 @@ def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], colo
         at = of["measured"].max_shear
         if LOWER in of:
             edges = of[LOWER].volume_above_ml, of[UPPER].volume_above_ml
-            axes.fill_between(at, *edges, color=_BAND, linewidth=0, label="95 % of truths")
+            axes.fill_between(at, *edges, color=_BAND, linewidth=0, label="95 % band of the true curve")
         for name in (name for name in ("measured", *colours) if name in of):
             colour, width = ("black", 2.2) if name == "measured" else (_colour(colours.index(name)), 1.5)
             axes.plot(at, of[name].volume_above_ml, color=colour, linewidth=width, label=name)
         for edge in strains:
             axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
         axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
-        label_axes(axes, "maximum shear strain", "volume above, mL", title)
+        label_axes(axes, "maximum shear strain", "volume above this strain, mL", title)
     spots[0].legend(fontsize=9, frameon=False)
     return figure
 
@@ -56,24 +56,24 @@ def _colour(number: int) -> str:
 
 
 def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Figure:
-    """Volume-strain curves of one tissue, measured (black) and simulated, a panel for each load.
+    """Strain-volume curves of one tissue, measured (black) and simulated, one panel for each load.
 
-    The grey band contains the true curve in 95 % of cases; areas are taken between the dotted lines.
+    The grey band contains the true curve in 95 % of cases. Areas are computed between the dotted lines.
     """
     models = [name for name in dict.fromkeys(c.field for c in curves) if name not in ("measured", LOWER, UPPER)]
     return _curves(curves, "load", strains, models)
 
 
 def all_loads(curves: Sequence[Curve], strains: tuple[float, float]) -> bytes:
-    """Volume of tissue above each maximum shear strain, a panel for each load: measured (black) and simulated.
+    """Volume of tissue in which the maximum shear strain exceeds a value, for each load: measured (black), simulated.
 
-    The grey band contains the true curve in 95 % of cases; areas are taken between the dotted lines.
+    The grey band contains the true curve in 95 % of cases. Areas are computed between the dotted lines.
     """
     return png_bytes(curves_by_load(curves, strains))
 
 
 def areas_by_load(areas: Sequence[Area]) -> Figure:
-    """Area between curves by load and model: the estimate with its 95 % interval, or as measured if that is unknown."""
+    """Area between strain-volume curves by load and model: estimate with 95 % interval, or as measured if unknown."""
     models, loads = (list(dict.fromkeys(getattr(a, of) for a in areas)) for of in ("model", "load"))
     figure, (axes,) = chart()
     width = 0.6 / len(models)
@@ -84,7 +84,7 @@ def areas_by_load(areas: Sequence[Area]) -> Figure:
         axes.vlines(at, [a.low_ml for a in rows], [a.high_ml for a in rows], color=_colour(number), linewidth=1.8)
     axes.set_xticks(range(len(loads)), loads)
     axes.set(xlim=(-0.5, len(loads) - 0.5), ylim=(0.0, None))
-    label_axes(axes, "", "area between curves, mL")
+    label_axes(axes, "", "area between strain-volume curves, mL")
     axes.legend(fontsize=9, frameon=False)
     return figure
 
@@ -97,11 +97,11 @@ def _by_model(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray) -> bytes:
-    """Maximum shear strain on a slice, measured and simulated, on the deformed tissue.
+    """Maximum shear strain in a slice, measured and simulated, on the deformed tissue.
 
-    The slice contains the plate's normal and the direction of shear; the same cells in one colour scale. Grey is
-    undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
-    sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
+    The slice contains the plate's normal and the direction of shear. All panels show the same cells with one colour
+    scale; grey is undefined. Nodes outside the measurement are drawn with the displacement of the nearest node inside.
+    Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
     return png_bytes(slice_sheet(one.fields.mesh, slice_panels(one.fields, measured, u_mm), one.case.axes, point_mm))
 
@@ -116,7 +116,7 @@ def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str,
 def scatter(fields: MappedFields) -> bytes:
     """Simulated over measured maximum shear strain, cell by cell; darker is more volume (logarithmic).
 
-    Both agree on the line.
+    On the line, both are equal.
     """
     figure, spots = _by_model(len(fields.models))
     where = fields.common
@@ -152,9 +152,9 @@ def differences(one: LoadComparison, quantity: str) -> bytes:
 
 
 def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> bytes:
-    """Normalised area between curves of every subject (points) by model; the bar is the mean.
+    """Normalised area between strain-volume curves of each subject (points) by model; the bar is the mean.
 
-    Lines join the models of one subject.
+    Lines connect the models of one subject.
     """
     figure, (axes,) = chart()
     subjects = list(dict.fromkeys(s for model in models for s in shares[model]))
@@ -167,7 +167,7 @@ def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[st
         axes.plot([at - 0.25, at + 0.25], [mean, mean], color=INK, linewidth=2.5)
     axes.set_xticks(range(len(models)), list(models), rotation=30, ha="right")
     axes.set_ylim(bottom=0.0)
-    label_axes(axes, "", "normalised area between curves, %")
+    label_axes(axes, "", "normalised area, %")
     if len(subjects) <= len(REGION_COLOURS):
         axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

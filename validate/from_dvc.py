@@ -1,4 +1,4 @@
-"""Names of `dvc` that a user of `validate` needs as well."""
+"""Names of `dvc` that users of `validate` also need."""
 
 from dvc.errors import GeometryError, InputError, OutputError
 

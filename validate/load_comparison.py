@@ -25,28 +25,28 @@ from validate.mapping import ALL, MappedFields, map_fields
 _STRAINED = 0.01
 
 NOTHING = "no deformation"
-"""The model that predicts zero strain everywhere: the reference for areas, outside the ranking."""
+"""Name of a model that predicts zero strain everywhere: the reference for areas, outside the ranking."""
 
 Fields = tuple[Deformation, Sequence[FeResult]]
 
 
 @dataclass(frozen=True, slots=True)
 class Criteria:
-    """What models are compared by.
+    """Criteria of the comparison.
 
     Attributes
     ----------
     strains : (low, high)
-        Range of maximum shear strain over which volume-strain curves are compared.
+        Range of maximum shear strain over which strain-volume curves are compared.
     thresholds, least_ml : tuple of Threshold, float
         Maximum shear strains above which clusters are compared, and volume of the smallest cluster that counts, mL.
     seed : int
-        Of the truths drawn from the error model; draws of different loads are independent.
+        Of the true fields drawn from the error model; draws of different loads are independent.
 
     Raises
     ------
     InputError
-        If the range does not rise from 0 or more to 3 or less, or the volume is negative.
+        Unless the range increases and lies within 0 to 3, or if the volume is negative.
     """
 
     strains: tuple[float, float] = RANGE
@@ -57,27 +57,28 @@ class Criteria:
     def __post_init__(self) -> None:
         check_range(self.strains)
         if self.least_ml < 0.0:
-            raise InputError(f"The smallest cluster's volume must be 0 or more; got {self.least_ml:g} mL.")
+            raise InputError(f"The volume of the smallest cluster must not be negative; got {self.least_ml:g} mL.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadCase:
-    """One load: the measurement, and what each model predicts.
+    """One load: the measurement, and the result of each model.
 
     Attributes
     ----------
     read : callable
-        Gives the measured deformation (tissue relative to its bone, reference configuration, LPS mm) and the models'
-        results. It is called whenever they are needed, so that files may be read again rather than kept in memory.
+        Returns the measured deformation (tissue relative to its bone, reference configuration, LPS mm) and the results
+        of the models. It is called whenever they are needed, so that files can be read again instead of kept in memory.
     axes : (3, 3)
-        Of the plate, LPS; see `dvc.plate_axes`. By default the plate pushes to superior and shears to anterior.
+        Of the plate, LPS; see `dvc.plate_axes`. By default the plate presses in superior and shears in anterior
+        direction.
     error, verdict : ErrorTable, Verdict, or None
-        Error of the measured maximum shear strain, without which no figure has an interval, and no difference is
-        significant; and the verdict on the measurement.
+        Error of the measured maximum shear strain, and the verdict on the measurement. Without the error, results have
+        no intervals and no difference is significant.
     aligned_on : str
-        What the rigid alignment was computed on: "bone", "image" or "none"; empty if unknown.
+        What was aligned rigidly: "bone", "image" or "none"; empty if unknown.
     image : path or None
-        The loaded image, registered, shown in the viewer of the report.
+        The registered loaded image, shown in the viewer of the report.
     """
 
     load: str
@@ -97,17 +98,17 @@ class LoadCase:
         cls, load: str, measured: Deformation | Measurement, results: Sequence[FeResult],
         error: ErrorTable | None = None,
     ) -> Self:  # fmt: skip
-        """A load whose fields are in memory; set the rest with `dataclasses.replace`.
+        """A load whose fields are in memory; set the other attributes with `dataclasses.replace`.
 
         Parameters
         ----------
         measured : Deformation or Measurement
-            Of tissue relative to its bone, reference configuration, LPS mm. A measurement also gives its error, its
-            verdict, what it was aligned on, and the plate's axes where a shear direction was given.
+            Of tissue relative to its bone, reference configuration, LPS mm. A `Measurement` also gives its error, its
+            verdict, its rigid alignment, and the plate's axes if a shear direction was given.
         results : sequence of FeResult
             One for each model (`FeResult.of`, `read_result`).
         error : ErrorTable, optional
-            Error of the measured maximum shear strain, in place of the measurement's own.
+            Error of the measured maximum shear strain; replaces that of the measurement.
         """
         if not isinstance(measured, Measurement):
             return cls(load, partial(_given, measured, results), error=error)
@@ -118,14 +119,14 @@ class LoadCase:
         return case if axes is None else replace(case, axes=axes)
 
     def fields(self) -> Fields:
-        """The measured deformation and the models' results; InputError without a model, or for two of one name."""
+        """The measured deformation and the results; InputError without a model, or if two models have the same name."""
         measured, results = self.read()
         check(f"{self.load}: results", results, Sequence[FeResult])
         if not results:
-            raise InputError(f"{self.load}: no model is given.")
+            raise InputError(f"{self.load}: there is no model to compare.")
         names = [NOTHING, *(result.name for result in results)]
         if twice := next((name for name in names if names.count(name) > 1), None):
-            raise InputError(f"{self.load}: two models are called '{twice}'; give each a name of its own.")
+            raise InputError(f"{self.load}: two models are named '{twice}'; rename one of them.")
         return measured, results
 
 
@@ -140,9 +141,9 @@ class LoadComparison:
     Attributes
     ----------
     labels, bones : LabelMap, tuple of str
-        Of the unloaded image, and which of its labels are bone.
+        Labels of the unloaded image, and those that are bone.
     areas : tuple of Area
-        By model and tissue; that of all soft tissue first. Those of `NOTHING` come last.
+        By model and tissue, with all soft tissue first. Those of `NOTHING` are last.
     bands : mapping of tissue to Band
         Empty where the measurement uncertainty is unknown.
     """
@@ -172,9 +173,9 @@ class LoadComparison:
         return bool(above < _STRAINED * volumes.sum())
 
     def ranked(self) -> list[Area]:
-        """Areas of the ranked models in all soft tissue, the smallest first, by the estimate where there is one.
+        """Areas of the ranked models in all soft tissue, smallest first, by the estimate if there is one.
 
-        Levelled models are not ranked, since no bias is removed from their areas; nor is `NOTHING`.
+        Levelled models are not ranked, since no bias is removed from their areas. `NOTHING` is not ranked either.
         """
         models = (a for a in self.areas if a.tissue == ALL and a.model != NOTHING and not a.levelled)
         return sorted(models, key=lambda a: a.best_ml)
@@ -190,7 +191,7 @@ def compare_load(
     case: LoadCase, labels: LabelMap, bones: Sequence[str] = ("bone",), *,
     mesh: TetMesh | None = None, criteria: Criteria | None = None,
 ) -> LoadComparison:  # fmt: skip
-    """Compare models with the measurement of one load, at the centroids of one mesh's cells.
+    """Compare models with the measurement of one load, at the centroids of the cells of one mesh.
 
     Parameters as in `validate.compare`, errors as in `validate.map_fields`.
     """
@@ -217,7 +218,7 @@ def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Crite
             volumes = fields.volumes_ml[where]
             area = area_between(fields.measured.max_shear[where], shear[where], volumes, by.strains)
             normalised = area / volumes.sum() / (by.strains[1] - by.strains[0])
-            # a levelled model carries the measurement's bias itself: nothing is to be removed
+            # a levelled model has the bias of the measurement itself, so none is removed
             estimated = known[tissue].interval(name) if tissue in known and not name.endswith(LEVELLED) else ()
             yield Area(name, load, tissue, area, normalised, *estimated)
 
@@ -238,14 +239,14 @@ def _overlaps(fields: MappedFields, case: LoadCase, by: Criteria, truths: Sequen
 
 
 def _shears(fields: MappedFields) -> dict[str, FloatArray]:
-    """Maximum shear strain of each model, and of none."""
+    """Maximum shear strain of each model, and of `NOTHING`."""
     return {name: of.max_shear for name, of in fields.models.items()} | {NOTHING: np.zeros(len(fields.points_mm))}
 
 
 def _bands(
     fields: MappedFields, case: LoadCase, error: ErrorTable, by: Criteria, first: list[FloatArray]
 ) -> dict[str, Band]:
-    """Bands by tissue; the ``first`` truths drawn for them are kept, for the intervals of location."""
+    """Bands by tissue; the ``first`` true fields drawn for them are kept for the intervals of location."""
     common, seed = fields.common, zlib.crc32(case.load.encode()) + by.seed
     shear, tissues = fields.measured.max_shear[common], [str(t).lower() for t in fields.tissue[common]]
     draws = TruthDraws(fields.points_mm[common], shear, tissues, fields.to_bone_mm[common], error, seed)

@@ -21,18 +21,18 @@ from dvc.mesh import faces_of
 from dvc.trust.error_model import widened
 
 LEAST_ML = 0.1
-"""Volume of the smallest cluster that counts by default, mL."""
+"""Default volume of the smallest cluster that counts, mL."""
 
 LOCATION_DRAWS = 60
-"""Truths drawn for the location of a load: the first of those drawn for the curves."""
+"""Number of true fields for the location of a load: the first of those drawn for the curves."""
 
-_CELLS = 1000  # of a draw, for the Hausdorff distance: its percentile moves by 0.7 points, between draws by far more
+_CELLS = 1000  # per draw, for the Hausdorff distance; changes its percentile by 0.7 points, less than between draws
 _ENOUGH = 0.5  # fraction of the draws that must have a value
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """A maximum shear strain above which clusters are compared, and the source of the number."""
+    """A maximum shear strain above which clusters are compared, and the source of the value."""
 
     max_shear: float
     source: str
@@ -41,20 +41,20 @@ class Threshold:
 def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
     """Read thresholds from a CSV table; by default the one in the package.
 
-    Columns are max_shear, a maximum shear strain (E1 - E3) / 2 between 0 and 3 (no percent), and source, a text. A
-    table without them, or without a row, is an `InputError`.
+    Columns are max_shear, a maximum shear strain (E1 - E3) / 2 between 0 and 3 (not in percent), and source, a text.
+    InputError if a column is missing or the table has no row.
     """
     place = path if path is not None else files("validate") / "thresholds.csv"
     try:
         rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
         thresholds = tuple(Threshold(float(row["max_shear"]), row["source"].strip()) for row in rows)
     except OSError as error:
-        raise InputError(f"{place} cannot be read as thresholds: {error.strerror}.") from error
+        raise InputError(f"{place}: the thresholds cannot be read ({error.strerror}).") from error
     except (KeyError, ValueError, AttributeError) as error:
-        raise InputError(f"{place}: a table of thresholds has the columns max_shear and source ({error}).") from error
+        raise InputError(f"{place}: a table of thresholds needs the columns max_shear and source ({error}).") from error
     if not thresholds or not all(0.0 < t.max_shear < 3.0 for t in thresholds):
         raise InputError(
-            f"{place}: thresholds are maximum shear strains between 0 and 3 (no percent); it has "
+            f"{place}: thresholds must be maximum shear strains between 0 and 3 (not in percent); got "
             f"{[t.max_shear for t in thresholds]}."
         )
     return thresholds
@@ -76,7 +76,7 @@ class StrainCluster:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellGraph:
-    """Cells of a mesh, and which of them share a face.
+    """Cells of a mesh and their neighbours.
 
     Volumes (n,), mL, and centroids (n, 3), LPS mm, in the reference configuration; adjacency (n, n), sparse, one
     entry for each pair of cells with a common face.
@@ -98,11 +98,11 @@ class CellGraph:
         return cls(mesh.volumes_mm3 / 1000.0, mesh.centroids_mm, pairs)
 
     def part(self, kept: BoolArray) -> Self:
-        """Some of the cells (n,)."""
+        """The graph of some of the cells (n,)."""
         return type(self)(self.volumes_ml[kept], self.points_mm[kept], self.adjacency[kept][:, kept])
 
     def clusters(self, above: BoolArray, shear: FloatArray, least_ml: float = LEAST_ML) -> list[StrainCluster]:
-        """Clusters of the cells ``above`` (n,) of at least a volume, the largest first; ``shear`` (n,)."""
+        """Clusters of the cells ``above`` (n,) with at least the volume ``least_ml``, largest first; ``shear`` (n,)."""
         cells, number = self._components(above)
         kept = []
         for n in range(number.max() + 1 if len(cells) else 0):
@@ -115,7 +115,7 @@ class CellGraph:
         return sorted(kept, key=lambda c: -c.volume_ml)
 
     def region(self, above: BoolArray, least_ml: float = LEAST_ML) -> "StrainedRegion":
-        """All cells ``above`` (n,) that lie in a cluster of at least a volume."""
+        """All cells ``above`` (n,) in clusters with at least the volume ``least_ml``."""
         cells, number = self._components(above)
         kept = np.zeros(len(above), dtype=bool)
         if len(cells):
@@ -136,7 +136,7 @@ class Overlap:
     Attributes
     ----------
     measured_ml, model_ml : float
-        Volume of the clusters; the volume-strain curves also hold what lies above outside clusters.
+        Volume of the clusters; the strain-volume curves also include strained cells outside clusters.
     measured_mean, model_mean : float
         Volume-weighted mean of the maximum shear strain in them; NaN where there is none.
     dice : float
@@ -146,8 +146,8 @@ class Overlap:
     hausdorff95_mm : float
         Hausdorff distance at the 95th percentile (by volume), the larger of both directions, mm.
     measured_low_ml, measured_high_ml, dice_low ... : float
-        95 % intervals from the measurement uncertainty, and the value that a perfect model would get; NaN where no
-        error model is known. See `validate.location.with_intervals`.
+        95 % intervals from the measurement uncertainty, and the value that a perfect model would get; NaN without an
+        error model. See `validate.location.with_intervals`.
     """
 
     model: str
@@ -180,12 +180,12 @@ def overlap(
     model: str, load: str, threshold: float, measured: FloatArray, simulated: FloatArray,
     cells: CellGraph, least_ml: float = LEAST_ML,
 ) -> Overlap:  # fmt: skip
-    """Compare the clusters above a threshold of two fields on the same cells; undefined figures are NaN.
+    """Compare the clusters above a threshold of two fields on the same cells; undefined values are NaN.
 
     Parameters
     ----------
     model, load : str
-        As they stand in tables.
+        Names in tables.
     threshold : float
         Maximum shear strain above which cells are compared.
     measured, simulated : (n,)
@@ -227,7 +227,7 @@ class StrainedRegion:
         return float(self.volumes[inside] @ values[inside] / self.volume_ml) if inside.any() else float("nan")
 
     def distance95(self, other: Self, most: int | None = None) -> float:
-        """95th percentile (by volume) of these cells' distance (of ``most`` at equal steps) to another region, mm."""
+        """95th percentile (by volume) of the distance of the cells (at most ``most`` of them) to another region, mm."""
         cells = np.flatnonzero(self.above)
         cells = cells[:: max(1, len(cells) // most)] if most else cells
         alone = ~other.above[cells]
@@ -266,12 +266,13 @@ def with_intervals(
     overlaps: Sequence[Overlap], truths: Sequence[FloatArray], models: Mapping[str, FloatArray],
     cells: CellGraph, least_ml: float, widening: float,
 ) -> list[Overlap]:  # fmt: skip
-    """Overlaps of a load with 95 % intervals from truths drawn, and with the value that a perfect model would get.
+    """Overlaps of a load with 95 % intervals from drawn true fields, and with the value of a perfect model.
 
     Truths and models are the maximum shear strain in ``cells`` (n,); ``widening`` is the factor on intervals of draws,
-    see `dvc.trust.error_model.ErrorTable`. A perfect model's value is the median between one truth drawn and the next:
-    what noise alone takes from a Dice coefficient, and adds to a distance. An interval that reaches it is extended to
-    1, or to 0 mm. Distances have an interval where at least half of the truths have tissue above the threshold.
+    see `dvc.trust.error_model.ErrorTable`. The value of a perfect model is the median between one drawn true field and
+    the next: noise alone reduces a Dice coefficient and increases a distance to this value. An interval that reaches it
+    is extended to 1, or to 0 mm. Distances have an interval if at least half of the draws have tissue above the
+    threshold.
     """
     rows: list[Overlap] = []
     for threshold in dict.fromkeys(o.threshold for o in overlaps):
@@ -297,7 +298,7 @@ def with_intervals(
 
 
 def _interval(drawn: Sequence[float], widening: float) -> tuple[float, float, float]:
-    """Lower end, median and upper end of draws; NaN where too few have a value."""
+    """Lower end, median and upper end of draws; NaN if too few have a value."""
     known = np.array([d for d in drawn if not np.isnan(d)])
     if len(known) < max(2.0, _ENOUGH * len(drawn)):
         return (float("nan"),) * 3

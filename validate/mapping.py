@@ -1,4 +1,4 @@
-"""A measured and several simulated deformations, evaluated in the same cells."""
+"""A measured deformation and several simulated ones, evaluated in the same cells."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from dvc.errors import InputError
 from dvc.trust.regions import volume_above
 
 ALL = "all soft tissue"
-"""Name of all compared tissue together."""
+"""Name of all compared tissues together."""
 
 _OTHER = "unnamed"  # tissue of cells that are named neither by the mesh nor by the label map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """A deformation in the cells compared; NaN where not defined.
+    """A deformation in the compared cells; NaN where undefined.
 
     Attributes
     ----------
@@ -62,17 +62,17 @@ class MappedFields:
 
     @property
     def common(self) -> BoolArray:
-        """Cells (n,) in which the measurement and every model are defined: all are compared on the same tissue."""
+        """Cells (n,) in which the measurement and every model are defined; only these are compared."""
         return np.asarray(np.all([field.defined for field in self.by_name.values()], axis=0))
 
     @property
     def by_name(self) -> dict[str, Field]:
-        """Every field by name, that of the measurement first, as "measured"."""
+        """Every field by name; the first is the measurement, named "measured"."""
         return {"measured": self.measured, **self.models}
 
     @property
     def parts(self) -> dict[str, BoolArray]:
-        """Cells (n,) that are compared: `ALL`, and those of each tissue that has any."""
+        """Compared cells (n,) of `ALL`, and of each tissue that has any."""
         parts = {name: self.common & (self.tissue == name) for name in self.tissues}
         return {ALL: self.common} | {name: cells for name, cells in parts.items() if cells.any()}
 
@@ -95,9 +95,9 @@ class MappedFields:
 
 
 def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray:
-    """Values (n, k) at points (n, 3), mm, rows with NaN replaced by the row of the nearest point without.
+    """Values (n, k) at points (n, 3), mm, with rows that contain NaN replaced by the nearest complete row.
 
-    At least one row has to be without.
+    At least one row must be complete.
     """
     known = np.isfinite(values).all(axis=1)
     filled = values.copy()
@@ -109,12 +109,12 @@ def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray
 
 @checked
 def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
-    """Refuse bones that are not in the label map, with an `InputError` that names its labels."""
+    """InputError, with the labels of the map, for bones that are not in it."""
     known = labels.names.values()
     if missing := [name for name in bones if name not in known]:
         raise InputError(
-            f"The label map has no '{missing[0]}'; it has {', '.join(known)}. Bones are named by bones (--bone on the "
-            "command line), labels by their table (--names)."
+            f"The label map has no label '{missing[0]}'; its labels are {', '.join(known)}. Check the names of the "
+            "bones and the table of label names."
         )
 
 
@@ -128,16 +128,16 @@ def _sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
 def map_fields(
     mesh: TetMesh, labels: LabelMap, bones: Sequence[str], measured: Deformation, models: Mapping[str, Deformation]
 ) -> MappedFields:
-    """Evaluate a measured and simulated deformations at the centroids of a mesh's cells.
+    """Evaluate a measured deformation and simulated ones at the centroids of the cells of a mesh.
 
     Parameters
     ----------
     mesh : TetMesh
-        Reference configuration, LPS mm. Its regions give the tissues where they are called as those of the label map.
+        Reference configuration, LPS mm. Its regions give the tissues if they have the names of labels.
     labels : LabelMap
         Of the unloaded image.
     bones : sequence of str
-        Labels of bone; no cell whose centroid is there is compared.
+        Labels of bone; cells with their centroid in bone are not compared.
 
     Raises
     ------
@@ -151,17 +151,20 @@ def map_fields(
     points = mesh.centroids_mm
     bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
     distance, _ = cKDTree(labels.grid.points(bone)).query(points)
-    distance = np.maximum(distance - 0.5 * labels.grid.spacing_mm.min(), 0.0)  # from voxels' centres to the surface
+    distance = np.maximum(distance - 0.5 * labels.grid.spacing_mm.min(), 0.0)  # to the surface, not to voxel centres
     by_model, volumes = {name: _sampled(model, points) for name, model in models.items()}, mesh.volumes_mm3 / 1000.0
     fields = MappedFields(mesh, points, volumes, tissue, distance, _sampled(measured, points), by_model)
     if not fields.common.any():
         covered = "; ".join(f"{name} {volume:.1f} mL" for name, volume in fields.coverage().items())
-        raise InputError(f"Measurement and models are defined nowhere together ({covered}). Do they share a frame?")
+        raise InputError(
+            f"There is no cell in which the measurement and all models are defined ({covered}). Check that they are in "
+            "the same frame."
+        )
     return fields
 
 
 def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.ndarray:
-    """Tissue of each cell (m,) str: the mesh's region where it is called as a label, else the label at its centroid."""
+    """Tissue of each cell (m,) str: its region, if that is the name of a label; otherwise the label at its centroid."""
     names = set(labels.names.values())
     tissue = np.full(len(mesh.cells), _OTHER, dtype=f"<U{max(len(n) for n in (*names, _OTHER))}")
     nearest = np.rint(labels.grid.indices_of(mesh.centroids_mm)).astype(np.int64)

@@ -1,7 +1,7 @@
 """Constitutive models under measured (Dirichlet) boundary conditions: the measured displacement on a mesh's surface.
 
-Bone does not move; every other surface node has its measured displacement. The interior then depends on the
-constitutive models alone, not on how plate, contact and friction were idealised.
+Bone does not move; every other surface node gets its measured displacement. The interior then depends only on the
+constitutive models, not on assumptions about plate, contact and friction.
 """
 
 import time
@@ -39,7 +39,7 @@ def boundary_displacement(mesh: TetMesh, measured: Deformation) -> tuple[IntArra
     Raises
     ------
     InputError
-        If more than 1 % of the nodes lie over 3 mm from any at which the measurement is defined.
+        If more than 1 % of the nodes are over 3 mm away from the nearest node at which the measurement is defined.
     """
     nodes, u = _boundary(mesh, measured)
     return nodes, u[nodes]
@@ -52,12 +52,14 @@ def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArra
     u = measured.displacement(mesh.points_mm)
     known = np.isfinite(u).all(axis=1)
     if not known.any():
-        raise InputError("The measurement is defined at no node of the mesh. Do they share a frame?")
+        raise InputError(
+            "The measurement is not defined at any node of the mesh. Check that both are in the same frame."
+        )
     distance, _ = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
     if (far := np.count_nonzero(distance > _FAR_MM)) > _FEW * len(u):
         raise InputError(
-            f"{far} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the measurement is defined; it does "
-            "not cover the model."
+            f"The measurement does not cover the model: {far} of {len(u)} nodes are over {_FAR_MM:g} mm away from the "
+            "measured tissue."
         )
     u = filled_from_nearest(u, mesh.points_mm)
     if BONE in mesh.facets:
@@ -71,7 +73,7 @@ def simulate_driven(
 ) -> LoadState:  # fmt: skip
     """Equilibrium of a mesh with the measured displacement prescribed on its surface.
 
-    The state has no plate. If equilibrium was lost, it is the last converged increment, and ``reached`` is below 1.
+    The state has no plate. If equilibrium is lost, it is the last converged increment, and ``reached`` is below 1.
 
     Parameters
     ----------
@@ -80,7 +82,7 @@ def simulate_driven(
     measured : Deformation
         Of tissue relative to its bone, reference configuration, LPS mm.
     threads, tell : int, callable
-        Threads of the linear solver; ``tell`` gets a line for each increment.
+        Threads of the linear solver; ``tell`` is called with a line for each increment.
 
     Raises
     ------
@@ -110,7 +112,10 @@ def simulate_driven(
     finally:
         solver.close()
     if done == 0.0:
-        raise MrstrainError(f"{load}: no equilibrium was found with the measured displacement on the surface.")
+        raise MrstrainError(
+            f"{load}: no equilibrium was found with the measured displacement on the surface, not even at the first "
+            "increment."
+        )
     return LoadState(
         load=LoadStep(load, float("nan")), reached=done, u_mm=state[:count].reshape(-1, 3),
         pressure_mpa=model.pressures(state).mean(axis=1), gradients=model.gradients(state),
@@ -121,27 +126,27 @@ def simulate_driven(
 def write_boundary_conditions(
     stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray, *, unit: str = "mm", frame: str = "LPS"
 ) -> list[Path]:
-    """Write displacements of a mesh's nodes as boundary conditions for other codes, to be merged into a model.
+    """Write nodal displacements as boundary conditions for other codes, to be merged into a model.
 
     Parameters
     ----------
     stem : path
-        The files are called so, with ``.inp`` for Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb``
-        for FEBio 4; their paths are given back.
+        Path of the files without suffix: ``.inp`` is for Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D),
+        ``.feb`` for FEBio 4. The paths of the files are returned.
     nodes, u_mm : (k,), (k, 3)
-        As `boundary_displacement` gives them, LPS mm. Files have the node numbers of the mesh's file, or, if it has
-        none, numbers from 1, as `fe.write_calculix`.
+        From `boundary_displacement`, LPS mm. Files use the node numbers of the mesh file or, if it has none, numbers
+        from 1, as `fe.write_calculix`.
     unit, frame : {"mm", "m"}, {"LPS", "RAS"}
-        Of the mesh's file, in which the displacements are written.
+        Of the mesh file; displacements are written in these.
     """
     numbers = mesh.node_ids[nodes] + (1 if mesh.node_ids.min() == 0 else 0)
     u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
-    about = f"displacements in {unit}, {frame}, of nodes by their numbers in the mesh"
+    about = f"displacements of nodes, numbered as in the mesh; unit {unit}, frame {frame}"
     values = [(n, axis, value) for n, row in zip(numbers, u, strict=True) for axis, value in enumerate(row, start=1)]
     abaqus = [f"{n}, {axis}, {axis}, {value:.9g}" for n, axis, value in values]
     ansys = [f"D,{n},U{' XYZ'[axis]},{value:.9g}" for n, axis, value in values]
     files = {
-        stem.with_name(f"{stem.name}.inp"): [f"** {about}; into a *STEP", "*BOUNDARY", *abaqus],
+        stem.with_name(f"{stem.name}.inp"): [f"** {about}; insert into a *STEP", "*BOUNDARY", *abaqus],
         stem.with_name(f"{stem.name}.mac"): [f"! {about}", *ansys],
         stem.with_name(f"{stem.name}.feb"): _febio(numbers, u, about),
     }
@@ -153,7 +158,7 @@ def write_boundary_conditions(
 def _febio(numbers: IntArray, u: FloatArray, about: str) -> Iterator[str]:
     yield '<?xml version="1.0" encoding="ISO-8859-1"?>'
     yield f"<!-- {about} -->"
-    yield "<!-- to be merged into a model whose load controller 1 rises from 0 to 1 -->"
+    yield "<!-- merge into a model in which load controller 1 increases from 0 to 1 -->"
     yield '<febio_spec version="4.0">'
     yield f'<Mesh><NodeSet name="outside">{",".join(map(str, numbers))}</NodeSet></Mesh>'
     yield "<MeshData>"

@@ -1,4 +1,4 @@
-"""Checks that a model lies in the imaged tissue: slips of unit, frame or reference configuration."""
+"""Checks that a model lies in the imaged tissue; detects wrong units, frames and reference configurations."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -26,28 +26,28 @@ _ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 def check_models(
     cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *, each: Each = map
 ) -> list[str]:
-    """Check that every model lies in the imaged tissue; a sentence for each thing that looks wrong.
+    """Check that every model lies in the imaged tissue; returns a sentence for each possible input error.
 
-    ``each`` computes for several loads at once where it is that of `dvc.worker.side_by_side`.
+    With ``each`` from `dvc.worker.side_by_side`, several loads are checked at the same time.
 
     Raises
     ------
     InputError
-        If there is no case, two loads or two models of a load share a name, a case has no model, or the label map has
-        no such bone.
+        If there is no case, two loads or two models of a load have the same name, a case has no model, or the label map
+        has no such bone.
     GeometryError
-        If a model does not lie in the image, or less than 85 % of it in the labelled soft tissue.
+        If a model does not lie in the image, or if less than 85 % of it lies in the labelled soft tissue.
     """
     check_bones(labels, bones)
     if not cases:
-        raise InputError("No load is given to compare.")
+        raise InputError("There is no load to compare; at least one case is needed.")
     if len({case.load for case in cases}) < len(cases):
-        raise InputError(f"Each load needs a name of its own; got {', '.join(case.load for case in cases)}.")
+        raise InputError(f"Loads must have different names; got {', '.join(case.load for case in cases)}.")
     return [odd for of in each(partial(_odd_models, labels=labels, bones=bones), cases) for odd in of]
 
 
 def _odd_models(case: LoadCase, labels: LabelMap, bones: Sequence[str]) -> list[str]:
-    """What looks wrong about the models of one load."""
+    """Possible input errors of the models of one load."""
     warnings = []
     for result in case.fields()[1]:
         check_overlap(result.path, result.mesh, labels.grid)
@@ -58,8 +58,8 @@ def _odd_models(case: LoadCase, labels: LabelMap, bones: Sequence[str]) -> list[
 def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
     """Overlap of a mesh and the labelled soft tissue, as a fraction of the smaller volume.
 
-    Both in the reference configuration, LPS mm; all labels but ``bones`` are soft tissue. Below 85 % it is refused with
-    a `GeometryError`, which names ``path`` and shows both boxes.
+    Both are in the reference configuration, LPS mm; all labels except ``bones`` are soft tissue. Below 85 %, a
+    GeometryError names ``path`` and gives both bounding boxes.
     """
     soft = [number for number, name in labels.names.items() if name not in bones]
     tissue = tissues_of(mesh, labels, by_mesh=False)
@@ -72,62 +72,62 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
         own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
             f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: {own}; labelled soft "
-            f"tissue: {of_tissue} (LPS mm). It is turned, mirrored or moved against the image, or its label map is "
-            "another's: check unit and frame, or give the map to the image's frame."
+            f"tissue: {of_tissue} (LPS mm). The model may be rotated, mirrored or shifted, or the label map may be of "
+            "another subject. Check unit and frame, or give the rigid map to the frame of the image (to_image)."
         )
     return overlap
 
 
 def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
-    """Check a model against the label map; a sentence for each thing that looks wrong.
+    """Check a model against the label map; returns a sentence for each possible input error.
 
-    It looks wrong if less than 95 % of it lies in the labelled soft tissue, it names under 80 % of the tissue as the
-    label map does, it moves by over 1 mm at the bone, or its cells change their volume by over 15 % in the mean. Errors
-    as `check_in_tissue`.
+    Reported are models of which less than 95 % lies in the labelled soft tissue, whose tissue names agree with the
+    label map in under 80 % of the volume, that move by over 1 mm at the bone, or whose mean change of cell volume is
+    over 15 %. Errors as `check_in_tissue`.
     """
     mesh, warnings = result.mesh, []
     overlap = check_in_tissue(result.path, mesh, labels, bones)
     if overlap < _GOOD_OVERLAP:
-        warnings.append(f"{overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?")
+        warnings.append(f"only {overlap:.0%} of the model lies in the labelled soft tissue; check its frame.")
     names = [name for name in labels.names.values() if name not in bones]
     tissue, of_mesh = (tissues_of(mesh, labels, by_mesh=by_mesh) for by_mesh in (False, True))
     both, volume = np.isin(tissue, names) & np.isin(of_mesh, names), mesh.volumes_mm3
     same = float(volume[both & (of_mesh == tissue)].sum() / max(volume[both].sum(), 1e-12))
     if both.any() and same < _SAME_TISSUE:
         warnings.append(
-            f"model and label map name the same tissue in {same:.0%} of the volume alone; the names of one, or the "
-            "model's frame, are wrong."
+            f"model and label map have the same tissue name in only {same:.0%} of the volume; check the names, and the "
+            "frame of the model."
         )
     bone = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name in bones]))
     distance = cKDTree(bone).query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0]
     moved = np.linalg.norm(result.deformation.u_mm[distance < _NEAR_BONE_MM], axis=1)
     if len(moved) and np.median(moved) > _RIGID_MM:
         warnings.append(
-            f"the model moves by {np.median(moved):.1f} mm at the bone, and the measurement is relative to the bone; "
-            "take the bone's motion out of it."
+            f"the model moves by {np.median(moved):.1f} mm at the bone, but the measurement is relative to the bone; "
+            "remove the rigid motion of the bone from the model."
         )
     determinant = np.linalg.det(np.eye(3) + result.deformation.cell_gradients)
     change = float(volume @ np.abs(determinant - 1.0) / volume.sum())
     if change > _VOLUME_CHANGE:
         warnings.append(
-            f"its cells change their volume by {change:.0%} in the mean, which soft tissue does not; are displacements "
-            "in the frame and unit of the coordinates, and these the unloaded ones?"
+            f"the mean change of cell volume is {change:.0%}, which is implausible for soft tissue; check that "
+            "displacements have the frame and unit of the coordinates, and that these are the unloaded ones."
         )
     return [f"{result.name}: {warning}" for warning in warnings]
 
 
 def displacement_slip(fields: MappedFields, name: str) -> str:
-    """Whether a model's displacement fits the measured one only with another order of axes, frame or unit.
+    """A sentence if a model's displacement fits the measured one only with other axes, another frame or another unit.
 
-    The sentence that it gives names the slip; it is empty where none is detected.
+    It names the probable error, and is empty if none is detected.
 
     Notes
     -----
-    Direction and magnitude are tested separately, since a model that is too stiff or too soft is not a slip. The
-    direction is compared by the cosine <u, v> / (|u| |v|) of the measured displacement u and the model's v over all
-    cells, weighted by volume: a slip is reported if one of the 48 orders and signs of the components reaches 0.7 and
-    the components as stored have less than half of that. A sign or an exchange that hardly changes the displacement is
-    not reported. A slip of unit is reported if |v| / |u| is nearer to 1000 or 1/1000 than to 1.
+    Direction and magnitude are tested separately, since a model may be too stiff or too soft. The direction is compared
+    by the cosine <u, v> / (|u| |v|) of the measured displacement u and the model's v over all cells, weighted by
+    volume. An error is reported if one of the 48 orders and signs of the components reaches 0.7 and the components as
+    stored have less than half of that. A changed sign or order that hardly affects the displacement is not reported. A
+    wrong unit is reported if |v| / |u| is closer to 1000 or 1/1000 than to 1.
     """
     where = fields.common
     weight = fields.volumes_ml[where] / fields.volumes_ml[where].sum()
@@ -147,12 +147,12 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
         tied = (axes for axes, cosine in cosines.items() if cosine > most - _TIED)
         order, signs = min(tied, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
         axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
-        axes += " (the other of LPS and RAS)" if axes == "-x -y z" else ""
+        axes += " (LPS and RAS exchanged)" if axes == "-x -y z" else ""
         warnings.append(
-            f"fits far better with its components taken as {axes} (cosine {most:.2f}, as given {as_given:z.2f}): is it "
-            "in the frame and order of axes of the coordinates?"
+            f"fits the measured one far better with its components as {axes} (cosine {most:.2f}, as given "
+            f"{as_given:z.2f}); check its frame and the order of its components"
         )
     if abs(np.log(of_model / size)) > 0.5 * np.log(_UNIT):
-        unit = "in metres" if of_model < size else "1000 times too large"
-        warnings.append(f"is {of_model / size:.2g} times as large as the measured one: is it {unit}?")
-    return f"{name}: its displacement {', and '.join(warnings)}" if warnings else ""
+        unit = "it may be in metres" if of_model < size else "it may be 1000 times too large"
+        warnings.append(f"is {of_model / size:.2g} times as large as the measured one ({unit})")
+    return f"{name}: the displacement {', and '.join(warnings)}." if warnings else ""

@@ -1,4 +1,4 @@
-"""Models ranked by the area between curves: under each load, over all loads, and over subjects."""
+"""Models ranked by the area between strain-volume curves: under each load, over all loads, and over subjects."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ class Ranking:
     Attributes
     ----------
     areas, nothing : tuple of Area, Area
-        Over all loads: of the models that have every load, the best first and levelled ones last; and of `NOTHING`.
+        Over all loads: of the models that have every load, best first and levelled ones last; and of `NOTHING`.
     statements : tuple of str
-        Which model fits best and which differences are significant: over all loads, then under each.
+        The best match and the significant differences, over all loads, then under each load.
     not_distinguishable : mapping of load to Pairs
         Pairs whose areas do not differ significantly; those over all loads under `ALL_LOADS`.
     """
@@ -52,8 +52,8 @@ class Ranking:
 def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     """Sum the areas over loads, and rank the models.
 
-    Errors of different loads are taken as independent. The normalised area is the mean over loads. Statements name the
-    loads whose registration is not to be trusted.
+    Errors of different loads are assumed to be independent. The normalised area is the mean over loads. Statements name
+    loads whose verdict is Do not trust.
     """
     everywhere = [name for name in loads[0].fields.models if all(name in one.fields.models for one in loads)]
     band = _summed([one.bands.get(ALL) for one in loads], [*everywhere, NOTHING])
@@ -72,7 +72,7 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     statements = [_under(one, pairs[one.load]) for one in loads]
     if len(loads) > 1 and everywhere and informative is not None:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
-        caveat = f" The registration of {', '.join(distrusted)}, which counts in it, is not to be trusted."
+        caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
         caveat *= bool(distrusted)
         statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs)
@@ -84,7 +84,7 @@ def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
 
 
 def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
-    """Areas to the truths drawn, over all loads; None where the uncertainty of one is unknown."""
+    """Areas to the drawn true fields, over all loads; None if the uncertainty of one is unknown."""
     known = [band for band in bands if band is not None]
     if len(known) < len(bands):
         return None
@@ -94,22 +94,23 @@ def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
 
 
 def _pairs(ranked: Sequence[Area], band: Band | None) -> Pairs:
-    """Pairs whose areas do not differ significantly; all where the uncertainty is unknown."""
+    """Pairs whose areas do not differ significantly; all if the uncertainty is unknown."""
     pairs = combinations([a.model for a in ranked], 2)
     return tuple((a, b) for a, b in pairs if band is None or not (band.surely_below(a, b) or band.surely_below(b, a)))
 
 
 def _under(one: LoadComparison, pairs: Pairs) -> str:
-    """The statement on one load; empty where the uncertainty is unknown."""
+    """The statement on one load; empty if the uncertainty is unknown."""
     if one.hardly_strained:
         low = one.criteria.strains[0]
         return f"{one.load}: less than 1 % of the tissue exceeds {low:g}, so the area metric is not informative."
-    caveat = " Its registration is not to be trusted." * bool(one.case.verdict and one.case.verdict.level == "distrust")
+    distrusted = bool(one.case.verdict and one.case.verdict.level == "distrust")
+    caveat = " The registration of this load has the verdict Do not trust." * distrusted
     return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat) if ALL in one.bands else ""
 
 
 def _statement(where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str) -> str:
-    """The best model, and ranks that do not differ significantly from it or their neighbours; "" for a single model."""
+    """The best model, and models not distinguishable from it or from their neighbours; "" for a single model."""
     if len(ranked) < 2:
         return ""
     best, *others = (a.model for a in ranked)
@@ -118,8 +119,8 @@ def _statement(where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, 
     return (
         f"Best match {where} (area metric): {best}"
         + (f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other.")
-        + " It is no nearer to the measurement than no deformation at all." * (best in no_nearer(ranked, nothing))
-        + (f" Further down, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")
+        + " It is no better than a model without deformation." * (best in no_nearer(ranked, nothing))
+        + (f" Among the other models, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")
         + caveat
     )
 
@@ -138,8 +139,8 @@ class CohortRank:
     nearest_in : int
         Subjects in which it has the smallest area.
     behind, behind_low, behind_high : float
-        Mean paired difference to the area of the best model, and a simultaneous interval for all pairs of models: it
-        stays valid although the same subjects determined which model is the best.
+        Mean paired difference to the area of the best model, and its interval, which is simultaneous for all pairs of
+        models and therefore valid although the same subjects determined the best model.
     """
 
     model: str
@@ -161,10 +162,10 @@ class CohortRank:
 
 
 def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[CohortRank, ...]:
-    """Rank models by their normalised areas between curves, by subject, over the subjects that have all; best first.
+    """Rank models by their normalised areas over all subjects that have a result of every model; best first.
 
-    Subjects are taken as an independent sample of one population. Intervals are those of a mean: they narrow with more
-    subjects, and include the measurement error as far as it varies between subjects.
+    Subjects are assumed to be an independent sample of one population. Intervals are those of the mean: they narrow
+    with more subjects, and include the measurement error as far as it varies between subjects.
 
     Differences have Tukey's simultaneous 95 % intervals (honestly significant difference, subjects as blocks: Kutner
     and others, Applied Linear Statistical Models, section 21.5), which assume one residual variance for all models.
@@ -177,7 +178,7 @@ def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[Cohor
     names = list(shares)
     subjects = [s for s in dict.fromkeys(s for of in shares.values() for s in of) if all(s in shares[n] for n in names)]
     if not names or not subjects:
-        raise InputError("No subject has a result of every model, so they cannot be ranked.")
+        raise InputError("Models cannot be ranked over subjects, because no subject has a result of every model.")
     table = np.array([[shares[n][s] for s in subjects] for n in names])
     order = np.argsort(table.mean(axis=1), kind="stable")
     first, nearest, half = table[order[0]], np.argmin(table, axis=0), _simultaneous(table)
@@ -200,7 +201,7 @@ def _simultaneous(table: FloatArray) -> float:
     models, subjects = table.shape
     if models < 2 or subjects < 2:
         return float("nan")
-    from scipy.stats import studentized_range  # 0.3 s, for cohorts alone
+    from scipy.stats import studentized_range  # takes 0.3 s, only needed for cohorts
 
     rest = table - table.mean(axis=0) - table.mean(axis=1)[:, None] + table.mean()
     freedom = (models - 1) * (subjects - 1)

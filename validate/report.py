@@ -26,58 +26,60 @@ _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordanc
 _CLOSING = Section(
     "How to read this",
     paragraphs=(
-        "All fields are compared at the centroids of the same cells of one mesh, with the cells' volumes as weights, "
-        "in the reference (unloaded) configuration; cells in which the measurement or a model is undefined are left "
-        "out for all. Strain is Green-Lagrange, maximum shear strain (E1 - E3)/2. Displacement is that of tissue "
-        "relative to its bone, LPS mm.",
-        "The area between two volume-strain curves (the area validation metric, with volume in place of probability) "
-        "is the integral of the absolute difference of the volumes above a strain over the range of strain, in mL; the "
-        "normalised area is divided by the tissue's volume and the width of the range. Curves carry no location: two "
-        "fields may have one curve and differ everywhere. Overlap (Dice), distances of centroids, the Hausdorff "
-        "distance (95th percentile) and the agreement cell by cell show where the fields differ.",
+        "All fields are compared at the centroids of the same cells of one mesh, weighted by cell volume, in the "
+        "reference (unloaded) configuration. A cell in which the measurement or any model is undefined is left out "
+        "for all. Strain is Green-Lagrange; the maximum shear strain is (E1 - E3)/2. Displacement is relative to the "
+        "bone, LPS mm.",
+        "The area between two strain-volume curves (the area validation metric, with volume in place of probability) "
+        "is the integral of the absolute difference between the two volumes over the range of strain, in mL. The "
+        "normalised area is divided by the volume of the tissue and the width of the range. Curves contain no "
+        "information on location: two fields may have the same curve and differ everywhere. Overlap (Dice), distances "
+        "of centroids, the Hausdorff distance (95th percentile) and the agreement cell by cell show where the fields "
+        "differ.",
         "Intervals and the grey band come from the error model of the registration: true fields that are consistent "
         "with the measured one are drawn, and the model's area to each is computed. If an interval excludes the area "
-        "as measured, noise and smoothing have shifted the measured curve. Two models differ significantly if the area "
-        "of one is the smaller in 97.5 % of the draws, widened as the intervals are.",
+        "as measured, noise and smoothing have shifted the measured curve. Two models differ significantly if the same "
+        "one has the smaller area in 97.5 % of the draws, widened like the intervals.",
         "A measurement without a label map smooths strain discontinuities at tissue interfaces over about 4 mm, and "
-        "noise raises small shear strains; a model does neither. No comparison can show what the measurement does not: "
-        "scanner distortion, creep during a scan, tissue that slides along a smooth skin or inside a uniform region. "
-        "Thresholds of strain are not thresholds of injury unless their table says so and why.",
+        "noise increases small shear strains; a model does neither. A comparison cannot show effects that the "
+        "measurement cannot detect: scanner distortion, creep during a scan, and tissue that slides along a smooth "
+        "skin or inside a uniform region. Strain thresholds are not injury thresholds, unless their table says so "
+        "with a reason.",
     ),
 )  # fmt: skip
 
 
 Drawn = tuple[dict[str, Picture], Viewer, Strip]
-"""A load's pictures, by the stem of their files, its viewer, and its part of the first picture of the report."""
+"""Figures of a load, by the stem of their files, its viewer, and its part of the first figure of the report."""
 
 
 def draw(one: LoadComparison, colours: Sequence[str], image: Path | None) -> Drawn:
-    """Draw a load; ``colours`` lists all models in colour order, ``image`` shows the anatomy in all viewers."""
+    """Draw a load; ``colours`` lists all models in the order of colours, ``image`` is the anatomy in all viewers."""
     measured, results = one.case.read()
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
     tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
     point = lowest_bone_point(one.labels, bone, axes)
     across = (fields.mesh.points_mm - point) @ axes[:, 2]
-    through = f"It goes through the lowest point of {bone}."
+    through = f"The slice goes through the lowest point of {bone}."
     if not across.min() < 0.0 < across.max():
         point = fields.mesh.bounds_mm.mean(axis=0)
-        through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
+        through = f"The slice goes through the middle of the mesh, since the lowest point of {bone} is outside of it."
     slices = one, measured, displacements, point
     shear, u = ((figures.differences, one, quantity) for quantity in ("max_shear", "u_mm"))
     pictures = {
-        "curves": Picture.drawn("Volume above a strain", figures.volume_strain, one, tissues[:_PANELS], colours),
-        "slices": Picture.drawn("Where the strain lies", figures.slices, *slices, note=through),
+        "curves": Picture.drawn("Strain-volume curves", figures.volume_strain, one, tissues[:_PANELS], colours),
+        "slices": Picture.drawn("Location of the strain", figures.slices, *slices, note=through),
         "agreement": Picture.drawn("Maximum shear strain, cell by cell", figures.scatter, fields),
         "differences_shear": Picture.drawn("Differences of maximum shear strain", *shear),
-        "differences_u": Picture.drawn("Differences of the displacement's magnitude", *u),
+        "differences_u": Picture.drawn("Differences of displacement magnitude", *u),
     }
     lowest = lowest_bone_point(one.labels, bone, axes)
     return pictures, _viewer(one, measured, results, image), Strip.of(one, measured, results, lowest)
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
-    """Point of a bone furthest along the plate's outward normal, LPS mm; the mean of several."""
+    """Point of a bone furthest along the plate's outward normal, LPS mm; the mean if there are several."""
     points = labels.region(bone).points()
     height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
@@ -111,21 +113,21 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
     return Viewer(
         "Interactive 3-D viewer",
         f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}, over the "
-        "registered image of the first load. Drag to move through the slices, drag with the right button to rotate; "
-        "both views follow. Needs WebGL 2.",
+        "registered image of the first load. Drag to move through the slices; drag with the right button to rotate. "
+        "Both views move together. The viewer needs WebGL 2.",
         Volume.image("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
         (Volume.overlay("measured", grid, shear[0], most), Volume.overlay(model.name, grid, shear[1], most)),
     )
 
 
 def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: Viewer) -> list[Section]:
-    """A load's part of the report: how much and where, then cell by cell."""
+    """Sections of a load: amount and location of strain, then agreement cell by cell."""
     verdict = one.case.verdict
     words = [
-        "Compared: {common:.1f} mL of the mesh's {mesh:.1f} mL of soft tissue; the measurement is defined in "
+        "Compared volume: {common:.1f} mL of {mesh:.1f} mL of soft tissue in the mesh; the measurement is defined in "
         "{measured:.1f} mL.".format(**one.fields.coverage())
     ]
-    words += [] if verdict is None else [f"Verdict on its registration: {verdict.words}."]
+    words += [] if verdict is None else [f"Verdict on the registration: {verdict.words}."]
     curves, slices, *others = pictures.values()
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
@@ -137,17 +139,17 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
 def pictures_of_all(
     strips: Sequence[Strip], curves: Sequence[Curve], strains: tuple[float, float], ranking: Ranking
 ) -> dict[str, Picture]:
-    """The first pictures of a report, by the stem of their files: slices and curves under all loads."""
+    """The first figures of a report, by the stem of their files: slices and curves under all loads."""
     model = ranking.areas[0].model if ranking.areas else next(n for n in strips[0].max_shear if n != MEASURED)
     pages = [strip.max_shear[name] for strip in strips for name in (MEASURED, model) if name in strip.max_shear]
     known = np.concatenate([page[np.isfinite(page)] for page in pages])
     highest = max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
     best = "the best match over all loads" if ranking.areas else "a model"
-    note = f"Below: {model}, {best}. {strips[0].title}, through the lowest point of the bone."
+    note = f"Lower row: {model}, {best}. {strips[0].title}, through the lowest point of the bone."
     slices, of_all = (strips, model, highest), [curve for curve in curves if curve.tissue == ALL]
     return {
         "slices_by_load": Picture.drawn("Measured and simulated strain", strain_by_load, *slices, note=note),
-        "curves_by_load": Picture.drawn("Volume above a strain, all soft tissue", figures.all_loads, of_all, strains),
+        "curves_by_load": Picture.drawn("Strain-volume curves, all soft tissue", figures.all_loads, of_all, strains),
     }
 
 
@@ -155,7 +157,7 @@ def overview(
     loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[str], notes: Sequence[str],
     pictures: Sequence[Picture],
 ) -> Section:  # fmt: skip
-    """The first part of the report: which model fits best, pictures, areas, and ``warnings`` about models."""
+    """The first part of the report: best match, figures, areas, and ``warnings`` about models."""
     slips = Verdict("caution", tuple(warnings)) if warnings else None
     areas = (_areas(loads, ranking),)
     return Section(
@@ -170,14 +172,14 @@ def _head(one: LoadComparison) -> str:
 
 
 def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
-    """How a comparison is read, sources of its thresholds, and paragraphs for a methods section if there are any."""
+    """Explanation of a comparison, sources of its thresholds, and paragraphs for a methods section if there are any."""
     rows = tuple((t.max_shear, t.source) for t in thresholds)
-    sources = Section("Thresholds of strain", None, (Table("Thresholds", ("maximum shear strain", "source"), rows),))
+    sources = Section("Strain thresholds", None, (Table("Thresholds", ("maximum shear strain", "source"), rows),))
     return [_CLOSING, sources, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
 
 
 def shown(area: Area) -> str:
-    """An area in mL, with its 95 % interval where the measurement uncertainty is known."""
+    """An area in mL, with its 95 % interval if the measurement uncertainty is known."""
     known = not np.isnan(area.low_ml)
     return f"{area.best_ml:.2f}" + (f" ({area.low_ml:.2f} to {area.high_ml:.2f})" if known else "")
 
@@ -185,7 +187,7 @@ def shown(area: Area) -> str:
 def _ranks(ranking: Ranking, model: str) -> str:
     """Rank of a model over all loads: a range if not distinguishable from neighbours, a dash if not ranked."""
     ranks = "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
-    return ranks + f", no nearer than {NOTHING}" * (model in no_nearer(ranking.areas, ranking.nothing))
+    return ranks + f", no better than {NOTHING}" * (model in no_nearer(ranking.areas, ranking.nothing))
 
 
 def area_rows(areas: Iterable[Area], ranking: Ranking, loads: Sequence[str]) -> list[tuple[str, ...]]:
@@ -202,14 +204,14 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
     low, high = loads[0].criteria.strains
     *rows, nothing = area_rows([a for one in loads for a in one.areas], ranking, [one.load for one in loads])
     return Table(
-        f"Area between the volume-strain curves of soft tissue, strains {low:g} to {high:g}, mL",
+        f"Area between the strain-volume curves of soft tissue, strains {low:g} to {high:g}, mL",
         ("model", "rank", *(_head(one) for one in loads), "all loads"),
         tuple(rows),
-        "The best model over all loads first; the rank is a range where models are not distinguishable. Where the "
-        "measurement uncertainty is known, the area is the median over the true fields drawn, with a 95 % interval; "
-        "areas as measured, and by tissue, stand below and in areas.csv. Levelled models come last, with their area as "
-        "measured. Below the line: the area of a model that predicts zero strain everywhere; where a model's is no "
-        "smaller, that is said beside its rank.",
+        "The best model over all loads is first; the rank is a range if models are not distinguishable. If the "
+        "measurement uncertainty is known, the area is the median over the drawn true fields, with a 95 % interval. "
+        "Areas as measured and areas by tissue are given below and in areas.csv. Levelled models are last, with their "
+        "area as measured. The row below the line is a model that predicts zero strain everywhere; models that are no "
+        "better than it are marked in the column rank.",
         (nothing,),
     )
 
@@ -222,8 +224,8 @@ def _tissues(one: LoadComparison) -> Table:
         "Area between the curves, by tissue",
         ("model", "tissue", "as measured, mL", "normalised, %", "estimate, mL", "95 % from", "to", "perfect model"),
         cells(a for a in one.areas if a.model != NOTHING),
-        "As measured: with the measurement's noise and smoothing. Estimate and interval: with these removed. Perfect "
-        "model: the area from noise alone; an interval that reaches it begins at 0.",
+        "As measured: with the noise and smoothing of the measurement. Estimate and interval: with these removed. "
+        "Perfect model: the area that noise alone causes; an interval that reaches it begins at 0.",
         cells(a for a in one.areas if a.model == NOTHING),
     )
 
@@ -244,20 +246,20 @@ def _location(one: LoadComparison) -> Table:
         if not np.isnan(o.measured_low_ml)
     }  # fmt: skip
     known = (
-        "In brackets 95 % intervals with the measurement's bias and noise removed, so that one may exclude the value "
-        "as measured; below the line the values of a perfect model, from noise alone: an interval that reaches one is "
-        "extended to 1, or to 0 mm. "
+        "In brackets: 95 % intervals with the bias and noise of the measurement removed; they may exclude the value as "
+        "measured. Below the line: values of a perfect model, from noise alone; an interval that reaches such a value "
+        "is extended to 1, or to 0 mm. "
         if perfect
-        else "The measurement uncertainty is unknown: no intervals. "
+        else "The measurement uncertainty is unknown, so there are no intervals. "
     )
     return Table(
-        "Tissue above a threshold of strain: volume and location",
+        "Tissue above a strain threshold: volume and location",
         ("model", "above", "measured, mL", "model, mL", "clusters", "mean max. shear", "Dice", "centroids, mm",
          "largest, mm", "Hausdorff, mm"),
         rows,
-        known + "Clusters are connected cells of at least the smallest volume: their number and mean maximum shear "
-        "strain, measured / model's; distances of the centroids of all together, and of the largest; Hausdorff "
-        "distance at its 95th percentile.",
+        known + "Clusters are connected cells with at least the smallest volume. Their number and mean maximum shear "
+        "strain are given as measured / model. Centroids: distance between the centroids of all clusters together; "
+        "largest: between those of the largest clusters. Hausdorff: 95th percentile of the Hausdorff distance.",
         tuple(perfect.values()),
     )  # fmt: skip
 
@@ -279,10 +281,9 @@ def _agreement(one: LoadComparison) -> tuple[Table, Table]:
             ("model", "quantity", "tissue", *_AGREED),
             tuple(row for row in rows if row[2] in tissues),
             "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
-            "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
-            "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
-            "measured, without intervals: the error model covers maximum shear strain, and there is none of "
-            "displacement.",
+            "concordance, and Bland-Altman limits of agreement. For displacement, regression and concordance pool the "
+            "three components, RMSE is that of the difference vector, and the other values are of the magnitude. All "
+            "values are as measured and have no intervals; there is no error model of displacement.",
         ),
         Table(
             "Agreement by distance to bone", ("model", "quantity", "where", *_AGREED),
@@ -292,7 +293,7 @@ def _agreement(one: LoadComparison) -> tuple[Table, Table]:
 
 
 def _rounded(row: Agreement | SkinDisplacement, first: int) -> tuple[float, ...]:
-    """Figures of a row from the first on; what rounding leaves of a zero, and its sign, is dropped."""
+    """Values of a row from the ``first`` on; rounding errors of zero, and its sign, are removed."""
     return tuple(round(figure, 9) + 0.0 for figure in astuple(row)[first:])
 
 
@@ -305,6 +306,6 @@ def _skin(one: LoadComparison) -> Table:
             (t.model, t.nodes, *_rounded(t, 3)[:4], *(100.0 * change for change in _rounded(t, 3)[4:]))
             for t in one.skin
         ),
-        "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and "
-        "tangential to it; mean det F - 1.",
+        "Mean displacement 1 mm inside the skin that is on the plate in the model: inward (against the plate's outward "
+        "normal) and tangential. Volume change: mean of det F - 1.",
     )  # fmt: skip

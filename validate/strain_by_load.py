@@ -1,4 +1,4 @@
-"""Measured and simulated strain in one slice of the image under every load: the first picture of a report."""
+"""Measured and simulated strain in one slice of the image under every load: the first figure of a report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ _COLOURS = colormaps["viridis"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strip:
-    """A slice of one load: the image, outlines, and the max. shear as measured and by each model, on its voxels."""
+    """A slice of one load: the image, outlines, and the measured and simulated max. shear on its voxels."""
 
     load: str
     plane: Plane
@@ -52,11 +52,11 @@ class Strip:
     title: str
     image: FloatArray  # rows downward, columns to the right; 0 to 1
     outlines: tuple[BoolArray, ...]
-    max_shear: Mapping[str, Float32Array]  # by model, and as `MEASURED`; NaN where it is not defined
+    max_shear: Mapping[str, Float32Array]  # by model, and of `MEASURED`; NaN where undefined
 
     @classmethod
     def of(cls, one: LoadComparison, measured: Deformation, results: Sequence[FeResult], point_mm: FloatArray) -> Self:
-        """The slice of the label map's voxels through a point, LPS mm, nearest to the plate's normal and shear."""
+        """The voxel slice through a point, LPS mm, that is closest to the plane of the plate's normal and shear."""
         labels, scanned = one.labels, one.case.image
         across = np.abs(np.cross(one.case.axes[:, 0], one.case.axes[:, 1]))
         plane = PLANES[int(np.argmax(across))]
@@ -82,7 +82,7 @@ class Strip:
 
 
 def _in_slice(view: View, plane: Plane) -> BoolArray:
-    """The voxels (ni, nj, nk) of a grid that the slice of a view shows."""
+    """The voxels (ni, nj, nk) of a grid that are in the slice of a view."""
     inside, at = np.zeros(view.grid.shape, dtype=bool), AXES[plane][0]
     everywhere = [slice(None)] * 3
     everywhere[at] = slice(view.index[at], view.index[at] + 1)
@@ -91,9 +91,9 @@ def _in_slice(view: View, plane: Plane) -> BoolArray:
 
 
 def strain_by_load(strips: Sequence[Strip], model: str, highest: float) -> bytes:
-    """Maximum shear strain in one slice of the unloaded anatomy, under each load: measured above, a model below.
+    """Maximum shear strain in one slice of the unloaded anatomy under each load: measured (top) and a model (bottom).
 
-    White lines are the surface of the body and of the bones. The image stays grey where strain is not defined.
+    White lines are the surfaces of the body and of the bones. The image is grey where strain is not defined.
     """
     first = strips[0]
     left, right, bottom, top = first.extent_mm
@@ -134,7 +134,7 @@ def _paint(axes: Axes, strip: Strip, name: str, norm: Normalize) -> None:
 
 
 def _mark(axes: Axes, strip: Strip) -> None:
-    """Letters of the sides of the body, and a scale bar."""
+    """Letters for the sides of the body, and a scale bar."""
     white: dict[str, Any] = {"color": "white", "path_effects": SHADOW, "transform": axes.transAxes}
     spots = (0.015, 0.5, "left", "center"), (0.985, 0.5, "right", "center"), (0.5, 0.985, "center", "top")
     for letter, (x, y, ha, va) in zip(LETTERS[strip.plane], (*spots, (0.5, 0.015, "center", "bottom")), strict=True):

@@ -1,4 +1,4 @@
-"""The files of a comparison: tables of every figure, fields on the mesh, and maps on the image's voxels."""
+"""The files of a comparison: tables of all results, fields on the mesh, and maps on the voxels of the image."""
 
 import csv
 import json
@@ -25,16 +25,16 @@ RECORD = "comparison.json"
 TABLES = {"areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement}
 CURVES = "curves.csv"
 LOWER, UPPER = "measured, low", "measured, high"
-"""Fields of the curves that bound the 95 % band of the true one."""
+"""Names of the curves that bound the 95 % band of the true curve."""
 _CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml", "verdict")
-_STEP = 0.005  # of the curves that are written
+_STEP = 0.005  # of strain, in written curves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A volume-strain curve: the volume of tissue that exceeds each maximum shear strain, (k,).
+    """A strain-volume curve: the volume of tissue that exceeds each maximum shear strain, (k,).
 
-    Its field is "measured", a model, or an edge of the 95 % band of the true curve: "measured, low", "measured, high".
+    ``field`` is "measured", a model, or an edge of the 95 % band of the true curve: "measured, low", "measured, high".
     """
 
     load: str
@@ -62,7 +62,7 @@ def write_tables(
 ) -> None:
     """Write the rows of each of the `TABLES`, in their order, and a row for each point of the curves.
 
-    Each has the verdict on its load; empty if there is none.
+    Each row has the verdict on its load; empty if there is none.
     """
     for (name, kind), rows in zip(TABLES.items(), tables, strict=True):
         head = [*(f.name for f in fields(kind)), "verdict"]
@@ -76,7 +76,7 @@ def write_tables(
 
 
 def read_tables(folder: Path) -> list[tuple[Any, ...]]:
-    """Rows of each of the `TABLES`, to the six digits of the file; one that is no such table is an `InputError`."""
+    """Rows of each of the `TABLES`, to the six digits of the file; InputError if a file is not such a table."""
     tables: list[tuple[Any, ...]] = []
     for name, kind in TABLES.items():
         readers = get_type_hints(kind)  # int, float or str
@@ -86,7 +86,7 @@ def read_tables(folder: Path) -> list[tuple[Any, ...]]:
 
 
 def read_curves(folder: Path) -> tuple[Curve, ...]:
-    """The curves that `write_tables` wrote; errors as `read_tables`."""
+    """Read the curves of `write_tables`; errors as `read_tables`."""
     points: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for row in _rows(folder / CURVES, _CURVE_COLUMNS):
         key = row["load"], row["tissue"], row["field"]
@@ -99,15 +99,17 @@ def _rows(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a table of a comparison ({error}).") from error
+        raise InputError(f"{path}: the table of the comparison cannot be read ({error}).") from error
     missing = [name for name in columns if rows and rows[0].get(name) is None]
     if missing:
-        raise InputError(f"{path} has no column {missing[0]}: it is no table of a comparison by this version.")
+        raise InputError(
+            f"{path} has no column {missing[0]}; the comparison was written by another version. Compare again."
+        )
     return rows
 
 
 def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
-    """Remove the files of an earlier comparison, and its folders of loads that are not compared any more."""
+    """Remove the files of an earlier comparison, and its folders of loads that are no longer compared."""
     try:
         earlier = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["coverage_ml"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -120,7 +122,7 @@ def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
 
 
 def write_fields(path: Path, one: LoadComparison) -> None:
-    """Measured and simulated maximum shear strain and displacement in the cells compared, for ParaView."""
+    """Write measured and simulated maximum shear strain and displacement in the compared cells, for ParaView."""
     mapped, arrays = one.fields, dict[str, list[FloatArray]]()
     for name, field in mapped.by_name.items():
         arrays |= {f"{name}_max_shear": [field.max_shear], f"{name}_u_mm": [field.u_mm]}
@@ -131,7 +133,7 @@ def write_fields(path: Path, one: LoadComparison) -> None:
 
 
 def write_on_image(folder: Path, one: LoadComparison) -> None:
-    """Each model's displacement and maximum shear strain on the label map's voxels; NaN outside labels or model."""
+    """Write displacement and max. shear of each model on the voxels of the label map; NaN outside labels or model."""
     grid, inside = one.labels.grid, one.labels.labels > 0
     for result in one.case.read()[1]:
         u = np.full((*grid.shape, 3), np.nan, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Cells of any kind as linear tetrahedra: what one evaluator of deformations needs."""
+"""Conversion of cells of any kind to linear tetrahedra, so that deformations are evaluated by one code."""
 
 import logging
 from collections.abc import Iterator
@@ -20,8 +20,8 @@ class Shape:
     """Geometry of a kind of cell, of any order."""
 
     corners: FloatArray  # (c, 3) reference coordinates
-    edges: tuple[Nodes, ...]  # pairs of corners, in the order of the nodes in their middles
-    faces: tuple[Nodes, ...]  # corners going around, seen from outside; quadrangles in the order of their middles
+    edges: tuple[Nodes, ...]  # pairs of corners, in the order of the midpoint nodes
+    faces: tuple[Nodes, ...]  # corners in order around the face; quadrangles in the order of their middle nodes
 
     @property
     def quadrangles(self) -> tuple[Nodes, ...]:
@@ -29,15 +29,15 @@ class Shape:
         return tuple(face for face in self.faces if len(face) == 4)
 
     def around(self, face: Nodes) -> Nodes:
-        """Nodes of a quadratic cell along the rim of a face: a corner, the middle of an edge, and so on."""
+        """Nodes of a quadratic cell along the rim of a face: a corner, a midpoint node, and so on."""
         middle = {frozenset(edge): len(self.corners) + n for n, edge in enumerate(self.edges)}
         pairs = zip(face, (*face[1:], face[0]), strict=True)
         return tuple(n for a, b in pairs for n in (a, middle[frozenset((a, b))]))
 
     def weights(self, nodes: Nodes, corners: Nodes) -> FloatArray:
-        """Weights with which values at ``nodes`` give that at the mean of ``corners``, exact for every quadratic field.
+        """Weights of the values at ``nodes`` that give the value at the mean of ``corners``; exact if quadratic.
 
-        The least ones that do so: those of the serendipity elements in the middles of their faces and bodies.
+        They are the smallest such weights: those of serendipity elements at the middles of faces and cells.
         """
 
         def monomials(at: FloatArray) -> FloatArray:
@@ -49,9 +49,9 @@ class Shape:
         return np.asarray(np.linalg.pinv(monomials(at[list(nodes)]).T) @ monomials(point[None])[0])
 
     def halved(self, face: Nodes) -> IntArray:
-        """Triangles (k, 3) of half its size that make up a face of a quadratic cell.
+        """Triangles (k, 3) of half the size that make up a face of a quadratic cell.
 
-        A quadrangle's have its middle in common: the nodes after those of the edges, in the order of the quadrangles.
+        Those of a quadrangle share its middle node. Middle nodes follow the edge nodes, in the order of quadrangles.
         """
         rim = self.around(face)
         if len(face) == 3:
@@ -90,26 +90,26 @@ SHAPES = {
 
 _log = logging.getLogger("validate.tetrahedra")
 
-# A ten-node tetrahedron, in cells of positive volume: four corners, and the octahedron between them around a diagonal.
+# A ten-node tetrahedron as tetrahedra of positive volume: four at the corners, and four of the octahedron between them.
 _TETRA10 = np.array(
     [(0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3), (6, 8, 4, 5), (6, 8, 5, 9), (6, 8, 9, 7), (6, 8, 7, 4)]
 )
-# Numbers of nodes of the quadratic cells that are taken whole.
+# Numbers of nodes of the quadratic cells of which all nodes are used.
 _SIZES = {"tetra": (10,), "hexahedron": (20, 27), "wedge": (15, 18), "pyramid": (13, 14)}
 _FLAT = 1e-9
 
-_Faces = list[tuple[IntArray, IntArray]]  # corners (m, c) of faces of cells, and the triangles (m, k, 3) they became
+_Faces = list[tuple[IntArray, IntArray]]  # corners (m, c) of faces of cells, and their triangles (m, k, 3)
 
 
 def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
-    """A mesh file's volume cells as linear tetrahedra, and a matrix that carries nodal values to its nodes.
+    """The volume cells of a mesh file as linear tetrahedra, and a matrix that maps nodal values to their nodes.
 
-    A quadratic tetrahedron becomes eight, through the middles of its edges. Hexahedra, wedges and pyramids are cut from
-    their middle, and so that neighbours fit: linear ones with the mean of the corners as middle, and faces along the
-    diagonal from their lowest node; quadratic ones through all their nodes, and those that the middles of quadrangles
-    and of the cell lack by the element's own interpolation, into tetrahedra of half the cell's size. Kinds with nodes
-    in some of these places only are taken by their corners, which is said in the log (``validate.tetrahedra``). Regions
-    and named surfaces are kept. A folded cell is refused with a `GeometryError`.
+    A quadratic tetrahedron becomes eight tetrahedra, through the midpoints of its edges. Hexahedra, wedges and pyramids
+    are divided from their middle, so that neighbours match. In linear cells the middle is the mean of the corners, and
+    faces are divided along the diagonal from their lowest node. Quadratic cells are divided through all their nodes
+    into tetrahedra of half the cell's size; missing nodes at the middles of quadrangles and cells are interpolated with
+    the shape functions of the element. Of cells with nodes in only some of these places, only the corners are used;
+    this is logged (``validate.tetrahedra``). Regions and named surfaces are kept. GeometryError for a folded cell.
     """
     nodes = _Nodes(mesh.points_mm)
     cells, parents, faces = list[IntArray](), list[IntArray](), _Faces()
@@ -118,7 +118,7 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
             continue
         whole = block.nodes.shape[1] in _SIZES[block.shape]
         if not whole and block.kind != block.shape:
-            _log.warning("Of cells of kind %s only the corner nodes are used.", block.kind)
+            _log.warning("Only the corner nodes of the %s cells are used.", block.kind)
         if block.shape == "tetra":
             children = block.nodes[:, _TETRA10] if whole else block.corners[:, None]
             cells.append(children.reshape(-1, 4))
@@ -150,7 +150,7 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
 
 
 def _numbered(mesh: MeshFile) -> Iterator[tuple[IntArray, CellBlock]]:
-    """The blocks of a file, each with the numbers of its cells."""
+    """The blocks of a file, with the numbers of their cells."""
     at = 0
     for block in mesh.blocks:
         yield at + np.arange(len(block.nodes)), block
@@ -158,14 +158,14 @@ def _numbered(mesh: MeshFile) -> Iterator[tuple[IntArray, CellBlock]]:
 
 
 class _Nodes:
-    """A file's nodes, and new ones between them: ``points`` (n, 3) LPS mm, and ``carry`` (n, nodes of the file)."""
+    """Nodes of a file, and new ones between them: ``points`` (n, 3) LPS mm, and ``carry`` (n, nodes of the file)."""
 
     def __init__(self, points: FloatArray) -> None:
         self.points, self._own = points, points
         self.carry = sparse.identity(len(points), format="csr")
 
     def add(self, between: IntArray, shares: FloatArray) -> IntArray:
-        """New nodes (m,) between the file's own (m, k), by shares (k,)."""
+        """New nodes (m,) between nodes of the file (m, k), with weights ``shares`` (k,)."""
         count, before = len(between), len(self.points)
         row = np.repeat(np.arange(count), between.shape[1])
         share = sparse.csr_matrix((np.tile(shares, count), (row, between.ravel())), shape=(count, len(self._own)))
@@ -175,7 +175,7 @@ class _Nodes:
 
 
 def _linear_faces(block: CellBlock) -> _Faces:
-    """Faces as triangles, quadrangles cut from their lowest node."""
+    """Faces as triangles; quadrangles are divided from their lowest node."""
     faces: _Faces = []
     for corners in (block.corners[:, list(face)] for face in SHAPES[block.shape].faces):
         count = corners.shape[1]
@@ -185,11 +185,11 @@ def _linear_faces(block: CellBlock) -> _Faces:
 
 
 def _quadratic(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
-    """Faces of quadratic cells as triangles of half their size, and the cells' middles (m,)."""
+    """Faces of quadratic cells as triangles of half their size, and the middles (m,) of the cells."""
     shape = SHAPES[block.shape]
     own, edged = block.nodes, len(shape.corners) + len(shape.edges)
     if own.shape[1] == edged:
-        # the middle of a quadrangle is one node for both its cells
+        # both cells of a quadrangle share its middle node
         rims = [shape.around(face) for face in shape.quadrangles]
         rim = np.concatenate([own[:, list(r)] for r in rims])
         _, first, which = np.unique(np.sort(rim[:, ::2], axis=1), axis=0, return_index=True, return_inverse=True)
@@ -207,11 +207,11 @@ def _quadratic_faces(own: IntArray, shape: Shape) -> _Faces:
 
 
 def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: IntArray, block: CellBlock) -> IntArray:
-    """Tetrahedra (k, 4) of positive volume over triangles (k, 3) around the middles (m,) of the cells (k,) they are of.
+    """Tetrahedra (k, 4) of positive volume between triangles (k, 3) and the middles (m,) of their cells (k,).
 
-    The triangles of a cell have the same sense around its surface. The normals of all have to point away from the
-    middle, or of all towards it if the file counts the other way round; a cell where one does not is folded, which its
-    volume shows: tetrahedra of a valid cell add up to the volume that its faces enclose.
+    The triangles of a cell have the same orientation on its surface. All normals must point away from the middle, or
+    all towards it if the file uses the other orientation; otherwise the cell is folded. This is detected by the volume:
+    the tetrahedra of a valid cell add up to the volume that its faces enclose.
     """
     tets = np.concatenate([triangles, middle[cell][:, None]], axis=1)
     corner = points[tets]
@@ -221,14 +221,14 @@ def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: In
     folded |= np.bincount(cell, np.abs(volume) <= _FLAT * size[cell]) > 0
     if folded.any():
         raise GeometryError(
-            f"{np.count_nonzero(folded)} {block.kind} cells are folded or flat, first that with nodes "
-            f"{block.nodes[np.argmax(folded)].tolist()}. Mend the mesh where it was made."
+            f"{np.count_nonzero(folded)} {block.kind} cells are folded or flat; the first has the nodes "
+            f"{block.nodes[np.argmax(folded)].tolist()}. Correct the mesh in the program that made it."
         )
     return np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)
 
 
 def _surfaces(mesh: MeshFile) -> dict[str, list[tuple[int, ...]]]:
-    """Faces of each named surface, by their corners: the flat cells of a region, or triangles of a set of nodes."""
+    """Faces of each named surface, by their corners: the surface cells of a region, or triangles of a node set."""
     flat: dict[int, tuple[int, ...]] = {}
     for numbers, block in _numbered(mesh):
         if block.shape in ("triangle", "quad"):
@@ -236,7 +236,7 @@ def _surfaces(mesh: MeshFile) -> dict[str, list[tuple[int, ...]]]:
     named = {
         name: rows for name, index in mesh.regions.items() if (rows := [flat[c] for c in index.tolist() if c in flat])
     }
-    if mesh.tets is not None:  # the tetrahedra's own nodes are some of the file's
+    if mesh.tets is not None:  # the nodes of the tetrahedra are a subset of the nodes of the file
         by_id = np.argsort(mesh.node_ids)
         place = by_id[np.searchsorted(mesh.node_ids, mesh.tets.node_ids, sorter=by_id)]
         named = {name: [tuple(r) for r in place[rows].tolist()] for name, rows in mesh.tets.facets.items()} | named
@@ -244,7 +244,7 @@ def _surfaces(mesh: MeshFile) -> dict[str, list[tuple[int, ...]]]:
 
 
 def _on_surface(corners: list[tuple[int, ...]], faces: _Faces, count: int) -> IntArray:
-    """Triangles (k, 3) that the faces with these corners became; a face that no cell has is left out."""
+    """Triangles (k, 3) of the faces with these corners; a face that belongs to no cell is left out."""
     wanted = {tuple(sorted(face)) for face in corners}
     there = np.zeros(count, dtype=bool)
     there[np.concatenate([np.array(face) for face in wanted])] = True

@@ -58,11 +58,11 @@ def test_a_result_that_reading_gives_is_checked_as_well() -> None:
 def test_two_models_and_two_loads_have_names_of_their_own() -> None:
     other = result("a", MESH, sheared(0.9))
     twice = validate.LoadCase.of("Load1", sheared(0.4), [MODEL, other])
-    with pytest.raises(MrstrainError, match="Load1: two models are called 'a'"):
+    with pytest.raises(MrstrainError, match="Load1: two models are named 'a'"):
         validate.compare([twice], labels())
-    with pytest.raises(MrstrainError, match="Each load needs a name of its own; got Load1, Load1"):
+    with pytest.raises(MrstrainError, match="Loads must have different names; got Load1, Load1"):
         validate.compare([CASE, CASE], labels())
-    with pytest.raises(MrstrainError, match="two models are called 'no deformation'"):
+    with pytest.raises(MrstrainError, match="two models are named 'no deformation'"):
         validate.compare_load(
             validate.LoadCase.of("a", sheared(0.4), [replace(MODEL, name="no deformation")]), labels()
         )

@@ -109,7 +109,7 @@ def compared(folder: Path, name: str, near: float, far: float) -> Path:
             "compare not run. Not run: none",
         ),
         (StageOutcome("compare", None, "The label map has no 'bone'."), "compare FAILED. The label map has no 'bone'."),
-        (None, "its study compares no model"),
+        (None, "its study has no model to compare"),
     ],
 )
 def test_a_table_that_an_earlier_run_left_is_not_ranked_over(tmp_path, monkeypatch, outcome, why):
@@ -128,12 +128,12 @@ def test_a_table_that_an_earlier_run_left_is_not_ranked_over(tmp_path, monkeypat
     ends: list[StageOutcome | None] = [well, well]
     both = cohort(places, out=tmp_path / "both")
     assert (both.ranking[0].model, both.ranking[0].subjects) == ("far", 2)
-    assert not any("not counted" in note for note in both.notes)
+    assert not any("is left out" in note for note in both.notes)
     ends[1] = outcome
     one = cohort(places, out=tmp_path / "one")
     assert (one.ranking[0].model, one.ranking[0].subjects) == ("near", 1)
-    assert any(note.startswith(f"Ben is not counted: {why}") for note in one.notes)
-    assert not any("not ranked over" in note for note in one.notes)  # said once
+    assert any(note.startswith(f"Ben is left out: {why}") for note in one.notes)
+    assert not any("not used for the ranking" in note for note in one.notes)  # said once
     with (tmp_path / "one" / "cohort.csv").open() as file:
         assert {row["subject"] for row in csv.DictReader(file)} == {"Ada"}
     assert read_study(places[1]).study.name in (tmp_path / "one" / "report.html").read_text()
@@ -155,7 +155,7 @@ def test_a_model_that_few_subjects_have_does_not_take_the_others_from_the_rankin
     done = cohort(places, out=tmp_path / "out")
     assert [(one.model, one.subjects) for one in done.ranking] == [("near", 3)]
     assert "far is not ranked: it has an area over all loads in only 1 of 3 subjects." in done.notes
-    assert not any("not ranked over" in note for note in done.notes)
+    assert not any("not used for the ranking" in note for note in done.notes)
 
 
 def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refused(tmp_path, monkeypatch):
@@ -166,7 +166,7 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
     ended = lambda studies, **_: [StudyRun(study, {"compare": StageOutcome("compare", record)}) for study in studies]  # noqa: E731
     monkeypatch.setattr("mrstrain.studies.cohort.run_studies", ended)
     alike = cohort(places, out=tmp_path / "alike")
-    assert not any("not measured and simulated alike" in note for note in alike.notes)
+    assert not any("measured or simulated differently" in note for note in alike.notes)
     assert "Mueller_Hans" not in "".join(file.read_text() for file in (tmp_path / "alike").iterdir())
 
     other = places[1] / "study.toml"
@@ -176,15 +176,15 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
         + '[registration]\nengine = "elastix"\n'
     )
     notes = cohort(places, out=tmp_path / "unlike").notes
-    begin = "Subjects are not measured and simulated alike, "
-    assert f"{begin}[loads.Load1] normal_n differs: none in Ada, Cy; 15 in Ben." in notes
-    assert f"{begin}[registration] engine differs: gauss-newton-borders in Ada, Cy; heel-mr in Ben." in notes
+    begin = "Subjects were measured or simulated differently; "
+    assert f"{begin}[loads.Load1] normal_n: none in Ada, Cy; 15 in Ben." in notes
+    assert f"{begin}[registration] engine: gauss-newton-borders in Ada, Cy; heel-mr in Ben." in notes
     assert len([note for note in notes if note.startswith(begin)]) == 2  # a shear of nothing is none
 
     for place, mu in zip(places, (10, 10, 999), strict=True):
         (place / "mine.toml").write_text(f'[mine]\n[mine.fat]\nlaw = "neo-Hooke"\nmu_kpa = {mu}\nnu = 0.49\n')
         (place / "study.toml").write_text(STUDY.format(name=place.name) + 'sets = ["mine.toml"]\n')
-    with pytest.raises(InputError, match="'mine' has other laws in Cy than in Ada"):
+    with pytest.raises(InputError, match="'mine' differs between Cy and Ada"):
         cohort(places, out=tmp_path / "laws")
     again = (places[0] / "mine.toml").read_text().replace("mu_kpa = 10\n", "mu_mpa = 0.01\n").replace("fat", "Fat")
     (places[1] / "mine.toml").write_text(again)
@@ -194,8 +194,8 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
         (places[1] / "study.toml").read_text() + 'limit_minutes = 5\n[loads.Load2]\nimage = "Load2.nii.gz"\n'
     )
     notes = cohort(places[:2], out=tmp_path / "more").notes
-    assert f"{begin}[loads] differs: Load1 in Ada; Load1, Load2 in Ben." in notes
-    assert f"{begin}[models] limit_minutes differs: none in Ada; 5 in Ben." in notes
+    assert f"{begin}[loads]: Load1 in Ada; Load1, Load2 in Ben." in notes
+    assert f"{begin}[models] limit_minutes: none in Ada; 5 in Ben." in notes
 
 
 def test_files_that_are_lacking_are_told_of_all_subjects_at_once(tmp_path):

@@ -180,7 +180,7 @@ def test_fields_are_compared_at_the_same_points_by_tissue_and_distance() -> None
     some = map_fields(mesh, labels(), ["bone"], sheared(0.4), {"whole": sheared(0.2), "part": small})
     assert some.coverage()["part"] == pytest.approx(4.0, rel=0.1)
     assert some.coverage()["common"] == some.coverage()["part"]
-    with pytest.raises(InputError, match="no 'calcaneus'"):
+    with pytest.raises(InputError, match="no label 'calcaneus'"):
         map_fields(mesh, labels(), ["calcaneus"], sheared(0.4), {})
 
 
@@ -304,7 +304,7 @@ def test_models_behind_the_nearest_that_noise_cannot_order_are_named_too() -> No
     first, second, third = (a.model for a in ranking.areas)
     assert (first, {second, third}) == ("right", {"below", "above"})
     for statement in ranking.statements:
-        best, order = statement.split(" Further down, not distinguishable: ")
+        best, order = statement.split(" Among the other models, not distinguishable: ")
         assert set(order.rstrip(".").split(" and ")) == {"below", "above"}
         assert best.endswith("(area metric): right, significantly better than every other.")
     assert ranking.not_distinguishable["all loads"] == ((second, third),)
@@ -315,7 +315,7 @@ def test_models_behind_the_nearest_that_noise_cannot_order_are_named_too() -> No
     assert [rank_over_loads(compared(5.0)).rank(name) for name in ("right", "below")] == [(1, 3), (1, 3)]
     sure = rank_over_loads(compared(1e-4))
     assert sure.not_distinguishable["all loads"] == ()
-    assert all("Further down" not in statement for statement in sure.statements)
+    assert all("Among the other models" not in statement for statement in sure.statements)
     assert sorted(sure.rank(name) for name in ("right", "below", "above")) == [(1, 1), (2, 2), (3, 3)]
 
 

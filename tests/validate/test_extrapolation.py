@@ -162,7 +162,7 @@ def test_what_cannot_be_levelled_is_refused(bumped: Bumped, monkeypatch: pytest.
     tmp_path = bumped.folder
     (tmp_path / "out").mkdir()
     for wrong, message in (
-        (tmp_path / "model" / "Load1.vtu", "no folder"),
+        (tmp_path / "model" / "Load1.vtu", "not a folder"),
         (tmp_path / "out", "file of a measured load|No (load|model)"),
     ):
         with pytest.raises(InputError, match=message):
@@ -175,7 +175,7 @@ def test_what_cannot_be_levelled_is_refused(bumped: Bumped, monkeypatch: pytest.
 
     with monkeypatch.context() as broken:
         broken.setattr("mrstrain.comparison.level.register", SimpleNamespace(with_options=fails))
-        with pytest.raises(RegistrationError, match=r"Load1 was not registered: .* folded"):
+        with pytest.raises(RegistrationError, match=r"Load1 could not be registered: .* folded"):
             level(tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "two", bone=tmp_path / "bone.nii.gz")
     with pytest.raises(InputError, match="needs the bone"):
         level(tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "two")

@@ -173,10 +173,10 @@ def test_what_does_not_lie_in_the_image_is_refused_with_what_would(tmp_path: Pat
     place = written(tmp_path, "vtu")["path"]
     check_overlap(place, read_result("heel", place).mesh, grid)
     lost = read_result("heel", written(tmp_path, "vtu", 1.0, (-1, -1, 1))["path"])
-    with pytest.raises(GeometryError, match=r"Model: -15 to -5 .*image: -10 to 30 .*the other of LPS and RAS"):
+    with pytest.raises(GeometryError, match=r"Model: -15 to -5 .*image: -10 to 30 .*the other frame \(LPS or RAS\)"):
         check_overlap(place, lost.mesh, grid)
     big = read_result("heel", written(tmp_path, "vtu", 0.1)["path"])  # centimetres
-    with pytest.raises(GeometryError, match="Give the map"):
+    with pytest.raises(GeometryError, match="Give the rigid map"):
         check_overlap(place, big.mesh, Grid((9, 9, 9), np.ones(3), np.array([100.0, 0.0, 0.0]), np.eye(3)))
 
 
@@ -189,7 +189,7 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
     files = written(tmp_path, "inp")
     with pytest.raises(InputError, match="give the table of its nodal displacements"):
         read_result("heel", files["mesh"])
-    with pytest.raises(InputError, match="needs the mesh"):
+    with pytest.raises(InputError, match="also needs the mesh"):
         read_result("heel", files["path"])
     for rows, head, message in (
         (TAGS, "node,a,b,c", "column 'node' and three"),

@@ -99,7 +99,7 @@ def test_boundary_conditions_are_in_the_meshs_own_numbers_unit_and_frame(tmp_pat
     nodes, u = boundary_displacement(mesh, SHEAR)
     abaqus, _, _ = write_boundary_conditions(tmp_path / "Load1", mesh, nodes, u, unit="m", frame="RAS")
     text = abaqus.read_text()
-    assert "in m, RAS" in text
+    assert "unit m, frame RAS" in text
     rows = [line.split(",") for line in text.splitlines() if line[0].isdigit()]
     found = {(int(n), int(a)): float(v) for n, a, _, v in rows}
     at = int(np.argmax(np.abs(u[:, 1])))

@@ -50,21 +50,21 @@ def test_a_slip_of_axes_frame_or_unit_is_named_under_a_small_load() -> None:
             )
             if cosine < 0.45:
                 # taken as it says, the displacement is the measured one again
-                axes = words.split("taken as ")[1].split(" (")[0].split()
+                axes = words.split("components as ")[1].split(" (")[0].split()
                 undone = np.stack([(-1) ** a.startswith("-") * slipped[:, "xyz".index(a[-1])] for a in axes], axis=1)
                 assert np.sqrt(weight @ ((undone - right) ** 2).sum(axis=1)) < 0.13, (order, signs, words)
                 named += 1
             elif cosine > 0.6:
                 assert words == "", (order, signs, words)
     assert named > 30
-    assert "taken as -x -y z (the other of LPS and RAS)" in told(found, rough * [-1.0, -1.0, 1.0])
-    assert told(found, 1e-3 * rough).endswith("times as large as the measured one: is it in metres?")
-    assert told(found, 1e3 * rough).endswith("is it 1000 times too large?")
+    assert "components as -x -y z (LPS and RAS exchanged)" in told(found, rough * [-1.0, -1.0, 1.0])
+    assert told(found, 1e-3 * rough).endswith("times as large as the measured one (it may be in metres).")
+    assert told(found, 1e3 * rough).endswith("(it may be 1000 times too large).")
     swapped = right[:, [1, 0, 2]]
     across = swapped - right * (0.999 * (weight @ (swapped * right).sum(axis=1)) / (weight @ (right**2).sum(axis=1)))
     assert "as given 0.00)" in told(found, across)  # a cosine of -0.0002
     both = told(found, 1e-3 * rough[:, [1, 0, 2]])
-    assert "taken as y x z" in both
+    assert "components as y x z" in both
     assert "in metres" in both
 
 

@@ -94,7 +94,7 @@ def test_the_lowest_point_of_bone_is_that_of_a_spur_along_the_outward_normal(
 
 
 @pytest.mark.parametrize(
-    ("aside", "words"), [(0.0, "goes through the lowest point of bone"), (30.0, "lies beside the mesh")]
+    ("aside", "words"), [(0.0, "goes through the lowest point of bone"), (30.0, "is outside of it")]
 )
 def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None:
     mesh, bone = cube(4), labels()
@@ -154,7 +154,7 @@ def test_what_is_written_is_what_was_found(study: Path) -> None:
     moved = sheared(0.5).displacement(mesh.points_mm)
     meshio.write(study / "part" / "Load1.vtu", meshio.Mesh(mesh.points_mm, [("tetra", kept)], {"u": moved}))
     done = compare(study / "measured" / "Load1", [study / "half", study / "part"], on_image=True, **given(study))
-    assert any(note.startswith("Load1: part covers 50% of the mesh") for note in done.comparison.notes)
+    assert any(note.startswith("Load1: part covers only 50% of the mesh") for note in done.comparison.notes)
     assert not any("half covers" in note for note in done.comparison.notes)
     (one,) = done.comparison.loads
     written = rows(study / "out" / "curves.csv")

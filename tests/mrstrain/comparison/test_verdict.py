@@ -36,15 +36,15 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
     found = done(study)
     assert found.comparison.verdict is not None
     assert found.comparison.verdict.level == "distrust"
-    reason = "Load2: its registration is not to be trusted: The map of Load2 folds."
+    reason = "Load2, registration (Do not trust): The map of Load2 folds."
     assert reason in found.comparison.notes
     summary = found.summary()
     assert summary[0] == "Verdict on the inputs: Do not trust"
     assert reason in summary
     over_all, first, second = found.comparison.ranking.statements
-    assert over_all.endswith("The registration of Load2, which counts in it, is not to be trusted.")
-    assert "not to be trusted" not in first
-    assert second.endswith("Its registration is not to be trusted.")
+    assert over_all.endswith("It includes Load2, whose registration has the verdict Do not trust.")
+    assert "Do not trust" not in first
+    assert second.endswith("The registration of this load has the verdict Do not trust.")
     told = json.loads((study / "out" / "comparison.json").read_text())
     assert told["verdict"]["level"] == "distrust"
     assert told["verdict"]["reasons"][0] == reason
@@ -66,7 +66,7 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
 def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(study: Path) -> None:
     sound = dict.fromkeys(("Load1", "Load2"), Verdict("trust"))
     assert verdict_on(sound) == Verdict(
-        "trust", ("The measurement: 2 registrations are sound. The models are compared below.",)
+        "trust", ("All 2 registrations can be trusted. The models are compared below.",)
     )
     assert verdict_on(dict.fromkeys(sound)) is None
     assert verdict_on(sound, ["It is mirrored."]) == Verdict("caution", ("It is mirrored.",))
@@ -80,12 +80,12 @@ def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(stu
     assert found.comparison.verdict is not None
     assert found.comparison.verdict.level == "distrust"
     first, *others, last = found.comparison.verdict.reasons
-    assert first.startswith("Load1: its registration is not to be trusted")
-    slips = [reason for reason in others if "fits far better" in reason]
+    assert first.startswith("Load1, registration (Do not trust)")
+    slips = [reason for reason in others if "far better with its components" in reason]
     assert [slip.split(" (cosine")[0] for slip in slips] == [
-        "Load2: turned: its displacement fits far better with its components taken as x -y z"
+        "Load2: turned: the displacement fits the measured one far better with its components as x -y z"
     ]
-    assert last.startswith("Load2: its registration is to be used with care")
+    assert last.startswith("Load2, registration (Use with care)")
     section = found.sections[0]
     assert section.verdict is not None
     assert section.verdict.level == "caution"
@@ -104,7 +104,7 @@ def test_what_is_refused_leaves_an_earlier_comparison_whole(study: Path) -> None
     field = study / "measured" / "Load2" / "displacement.nii.gz"
     whole = field.read_bytes()
     for more, error, message in (
-        ({"bones": ["calcaneus"]}, InputError, "no 'calcaneus'"),
+        ({"bones": ["calcaneus"]}, InputError, "no label 'calcaneus'"),
         ({"mesh": study / "nowhere.vtu"}, (InputError, ImageFileError), "nowhere.vtu"),
         ({"mesh": aside}, GeometryError, "aside.vtu: only 50% of the model lies in the labelled soft tissue"),
         ({"mesh": far}, GeometryError, "far.vtu does not lie in the image"),
