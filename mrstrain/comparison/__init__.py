@@ -1,1 +1,1 @@
-"""`compare`, `drive` and `level`: models against a measurement, and the methods text."""
+"""`compare`, `drive` and `level`: comparison of models with a measurement, and the methods text."""

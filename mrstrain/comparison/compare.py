@@ -1,4 +1,4 @@
-"""`compare`: finite-element models of any code against a measurement, from files to a report."""
+"""`compare`: comparison of finite-element models of any code with a measurement, from files to a report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 
-_BYTES_OF_A_LOAD = 1 << 30  # about what the process takes that compares one
+_BYTES_OF_A_LOAD = 1 << 30  # approximate memory of the process that compares one load
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """What `compare` gave: the comparison, and the parts of its report."""
+    """Result of `compare`: the comparison, and the sections of its report."""
 
     out: Path
     comparison: validate.Comparison
@@ -41,7 +41,7 @@ class Compared:
     taken: tuple[str, ...] = ()  # a line on what was taken from the record of the measurement
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         return [*self.taken, *self.comparison.summary(), f"Report: {self.out / REPORT}"]
 
 
@@ -59,9 +59,10 @@ def compare(
     Parameters
     ----------
     dvc : path
-        Results of `register` or `strain`: a folder for each load, or one of these.
+        Results of `register` or `strain`: the folder with one folder per load, or the folder of one load.
     models : sequence of path
-        Folders, with a file named after each load (Load1.vtu ...; .csv with ``model_mesh``), or a single load's file.
+        Folders with a file named after each load (Load1.vtu ...; .csv with ``model_mesh``), or the file of a single
+        load.
     out : path
         Gets ``report.html``, tables, and a folder for each load.
     loads : sequence of str
@@ -69,7 +70,7 @@ def compare(
     to_image : (4, 4), optional
         As in `validate.read_result`.
     towards : mapping, optional
-        Plate's outward normal and direction of shear of single loads, LPS (3,), where they differ.
+        Outward normal of the plate and direction of shear, LPS (3,), of loads with their own directions, by name.
     labelling, reading, directions, comparison
         Their fields are given as keywords, such as ``strains=...``.
     progress : callable, optional
@@ -78,8 +79,8 @@ def compare(
     Raises
     ------
     InputError
-        If measurement and models have no load in common, an input that is not given is not found as it was measured
-        with, or as in `validate.compare`.
+        If measurement and models have no load in common, or if an input that is not given is not found as it was
+        measured with; also as `validate.compare`.
     """
     target, tell, measurements = Path(out), progress or (lambda *_: None), result_folders(Path(dvc), loads)
     labelling, labels_given = fill_labels(labelling, measurements), labelling
@@ -103,7 +104,9 @@ def compare(
     }
     refuse_touching_inputs(target, list(files), [path for paths in inputs.values() for path in paths])
     if target.resolve() in [f.resolve() for f in (Path(dvc), *(m.folder for m in measurements), *map(Path, models))]:
-        raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
+        raise InputError(
+            f"{target} contains results to be compared and would be overwritten. Choose another out folder."
+        )
     common = None if comparison.mesh is None else _common_mesh(comparison.mesh, tissues, bones)
     compared = {m.load: m for m in measurements if m.load in files}
     cases = [_case(m, files[load], tissues.grid, own.get(load, axes)) for load, m in compared.items()]
@@ -116,7 +119,7 @@ def compare(
     }  # fmt: skip
     folders, of_models = {load: m.folder for load, m in compared.items()}, {file.name: file.path for file in results}
     with side_by_side("comparing", _at_once(len(cases))) as each:
-        # Every file is read once before anything is removed, and again in its turn: together they fill memory.
+        # Every file is read once before anything is removed, and again when needed: together they would fill memory.
         warnings = validate.check_models(cases, tissues, bones, each=each)
         make_output(target)
         record = provenance("compare", inputs, given)
@@ -131,18 +134,18 @@ def compare(
 
 
 def _at_once(loads: int) -> int:
-    """Number of loads that are compared at once, on the cores and in the memory that there are."""
+    """Number of loads that are compared at the same time with the available cores and memory."""
     memory = usable_memory_bytes()
     return max(1, min(loads, usable_cores(), loads if memory is None else memory // _BYTES_OF_A_LOAD))
 
 
 def _axes(normal: Sequence[float], shear: Sequence[float]) -> FloatArray:
-    """The plate's axes (3, 3) from its outward normal and the direction of shear, LPS."""
+    """Axes of the plate (3, 3) from its outward normal and the direction of shear, LPS."""
     return plate_axes(-np.asarray(normal, dtype=np.float64), shear)
 
 
 def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
-    """The mesh where all fields are compared, which has to lie in the labelled soft tissue."""
+    """The mesh on which all fields are compared; it must lie in the labelled soft tissue."""
     mesh = read_tet_mesh(path)
     validate.check_overlap(path, mesh, labels.grid)
     validate.check_in_tissue(path, mesh, labels, bones)

@@ -1,4 +1,4 @@
-"""`drive`: constitutive models under measured (Dirichlet) boundary conditions, free of plate, contact and friction."""
+"""`drive`: constitutive models under measured (Dirichlet) boundary conditions, without plate, contact and friction."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
-BOUNDARY, ENDING = "boundary", "-driven"  # folder of the boundary conditions for other codes; end of a set's folder
+BOUNDARY, ENDING = "boundary", "-driven"  # folder of the boundary conditions for other codes; suffix of a set's folder
 
 
 @door
@@ -34,11 +34,11 @@ def drive(
     mesh : path
         As in `simulate`; the surface set "bone" does not move.
     dvc : path
-        Results of `register` or `strain`: a folder for each load, or one of these.
+        Results of `register` or `strain`: the folder with one folder per load, or the folder of one load.
     out : path
         Gets a folder for each material set (SET-driven) with ``LOAD.vtu``, for `compare`, and a folder ``boundary``
-        with the displacements as boundary conditions for ANSYS, Abaqus and FEBio, by the mesh's node numbers, in its
-        unit and frame.
+        with the displacements as boundary conditions for ANSYS, Abaqus and FEBio, with the node numbers, unit and frame
+        of the mesh.
     material, coordinates, progress
         As in `simulate`.
     loads : sequence of str
@@ -49,7 +49,7 @@ def drive(
     Raises
     ------
     InputError
-        If mesh, sets or measurement cannot be used; before anything is computed.
+        If the mesh, a material set or the measurement cannot be used; before anything is computed.
     """
     target, place, tell = Path(out), Path(mesh), progress or (lambda *_: None)
     unit, frame, sets = coordinates.mesh_unit, coordinates.mesh_frame, material.sets
@@ -60,8 +60,8 @@ def drive(
     measurements = result_folders(Path(dvc), loads)
     if loose := [m.load for m in measurements if m.aligned_on == "none"]:
         raise InputError(
-            f"{', '.join(loose)}: the bone's motion was not removed from this measurement, and the model's bone does "
-            "not move. Register with a bone."
+            f"{', '.join(loose)}: the rigid motion of the bone was not removed from this measurement, but the bone of "
+            "the model does not move. Register again with a bone."
         )
     measured = {m.load: m.deformation() for m in measurements}
     prescribed = {load: boundary_displacement(read, field) for load, field in measured.items()}
@@ -94,7 +94,7 @@ def drive(
 def _drive_set(
     folder: Path, mesh: TetMesh, laws: Mapping[str, fe.Material], measured: Mapping[str, Deformation], threads: int
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Simulate all loads with one material set, and write them: the outcome of each load, and lines for a person."""
+    """Simulate all loads with one material set and write the results; the outcome of each load, and summary lines."""
     rows, outcome, log, lines = list[fe.RegionFigures](), dict[str, dict[str, float]](), list[str](), list[str]()
     name = folder.name.removesuffix(ENDING)
     for load, field in measured.items():

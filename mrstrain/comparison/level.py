@@ -1,4 +1,4 @@
-"""`level`: forward-model comparison, the measurement simulated on the displacement of a model (levelling)."""
+"""`level`: forward-model comparison (levelling), the measurement simulated on the displacement of a model."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,7 +34,7 @@ def level(
     loads: Sequence[str] = (), engine: options.EngineOptions, reading: ModelReading, seeded: options.Seeded,
     progress: OnProgress | None = None,
 ) -> Outcome:  # fmt: skip
-    """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
+    """Simulate the measurement of a model: its displacement warps the unloaded image, and the pair is registered.
 
     Parameters
     ----------
@@ -44,30 +44,30 @@ def level(
     model, reading
         A folder with a file for each load, and how it is read; as in `compare`.
     out : path
-        Gets a folder named as the model and "-levelled", for `compare` beside the model itself, and one ending in
-        "-work" with the warped images and, by load, their registration.
+        Gets the folder MODEL-levelled, for `compare` in addition to the model itself, and the folder MODEL-work with
+        the warped images and their registrations.
     subject_files, engine
-        As in `register` for the measurement; the bone is needed, and unknown elastix parameters are accepted.
+        As in the registration of the measurement. A bone is needed; unknown elastix parameters are accepted.
     loads, progress
-        As in `compare`; by default all loads that the model has a file of.
+        As in `compare`; by default all loads for which the model has a file.
     seeded
-        Threads of each registration; the seed is also that of the fresh noise.
+        Threads of each registration, and the seed, which is also that of the fresh noise.
 
     Raises
     ------
     InputError
-        If image, bone or model cannot be used, an input of the measurement is not found as it was, or the model folds;
-        before anything is registered.
+        If image, bone or model cannot be used, if an input of the measurement is not found as it was, or if the
+        displacement of the model folds; before anything is registered.
     RegistrationError
         If no load could be registered.
     """
     target, place, load0 = Path(out), Path(model), Path(dvc)
     taken: tuple[str, ...] = ()
     if not place.is_dir():
-        raise InputError(f"{place} is no folder with a model's results, a file for each load.")
+        raise InputError(f"{place} is not a folder with the results of a model (one file for each load).")
     if holds_results(load0):
         load0, subject_files, engine, taken = _from_record(load0, subject_files, engine)
-    # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
+    # Incompressibility is always enforced: the displacement extrapolated outside the model's mesh is not isochoric.
     volume = volume_kept(engine)
     how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
     engine_of(how, labelled=subject_files.labels is not None)  # refused now rather than after the images are made
@@ -85,7 +85,7 @@ def level(
     _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
     work, failures = target / f"{name}-work", []
     for load, result in results.items():
-        registered = work / "registered" / load  # a folder of its own, since a study levels several loads at once
+        registered = work / "registered" / load  # separate folders, since a study runs several loads at the same time
         try:
             register.with_options(
                 load0, [work / "images" / f"{load}.nii.gz"], out=registered, subject_files=subject_files,
@@ -93,7 +93,7 @@ def level(
                 running=options.Running(**dict(seeded)), progress=progress,
             )  # fmt: skip
         except (RegistrationError, WorkerError) as failed:
-            failures.append(f"{load} was not registered: {failed}")
+            failures.append(f"{load} could not be registered: {failed}")
         else:
             _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
@@ -117,9 +117,12 @@ def _from_record(
 
 
 def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int) -> tuple[dict[str, Image], list[str]]:
-    """The unloaded image warped by each result, with fresh noise; and where a result was smoothed to do so."""
+    """The unloaded image warped by each result, with fresh noise; and notes on results that were smoothed for it."""
     if subject.bone is None:
-        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is rigid.")
+        raise InputError(
+            "A forward-model comparison needs the bone, in which the displacement is zero: give its mask (bone), or a "
+            "label map and the name of its label (labels, bone_label)."
+        )
     images, notes = {}, []
     body = subject.tissue or tissue_mask(subject.reference)
     for load, result in results.items():
@@ -129,15 +132,15 @@ def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int)
         changed = float(np.mean(np.linalg.norm(difference, axis=1) > _CHANGED_MM))
         if changed > _FEW:
             notes.append(
-                f"{load}: where the model's cells are nearly flat it was smoothed before it warped the image, by over "
-                f"{_CHANGED_MM:g} mm in {changed:.0%} of its cells."
+                f"{load}: the displacement of the model was smoothed around nearly flat cells before the image was "
+                f"warped; it changed by over {_CHANGED_MM:g} mm in {changed:.0%} of the cells."
             )
         images[load] = synthetic_warp(subject.reference, body, field, Acquisition(seed)).image
     return images, notes
 
 
 def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mapping[str, object]) -> None:
-    """Make the folders, with the images; results of an earlier run are removed."""
+    """Make the folders and write the images; results of an earlier run are removed."""
     work = target / f"{name}-work"
     for folder in (target, target / name, work, work / "images", work / "registered"):
         make_output(folder)
@@ -149,7 +152,7 @@ def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mappi
 
 
 def _write(path: Path, mesh: TetMesh, registered: Path) -> None:
-    """Write the registered displacement at the nodes of a model's mesh; where undefined, that of the nearest node."""
+    """Write the registered displacement at the nodes of a model's mesh; gaps are filled from the nearest node."""
     (measured,) = result_folders(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
     write_tet_mesh(path, TetMesh(mesh.points_mm, mesh.cells, mesh.regions), {}, {"displacement_mm": u})

@@ -1,4 +1,4 @@
-"""What was done, in sentences for a methods section: filled in from the records beside what was compared."""
+"""Text for a methods section, generated from the records of the compared results."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from validate import Comparison, Criteria
 from validate.curves import DRAWS
 from validate.location import LOCATION_DRAWS
 
-# Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found goes without.
+# Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found has none here.
 _PAPERS = {
     "Klein 2010": "Klein S, Staring M, Murphy K, Viergever MA, Pluim JPW. elastix: a toolbox for intensity-based "
     "medical image registration. IEEE Trans Med Imaging 29(1):196-205, 2010. doi:10.1109/TMI.2009.2035616",
@@ -39,8 +39,8 @@ _PAPERS = {
     "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
     "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
 }
-_IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")  # roles in a record of the files read as images
-_GIVEN = "the displacement was taken as it was given."
+_IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")  # roles of image files in a record
+_GIVEN = "the displacement was used as given; there is no record of its registration."
 _PUBLISHED = {"trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam"}  # tables 2 and 3 of Trebbi 2023
 
 Record = Mapping[str, Any]
@@ -49,10 +49,10 @@ Record = Mapping[str, Any]
 def methods(
     measured: Mapping[str, Path], models: Mapping[str, Path], comparison: Comparison, criteria: Criteria
 ) -> tuple[str, ...]:
-    """Paragraphs for a methods section, the references last.
+    """Paragraphs for a methods section, with the references last.
 
-    ``measured`` are the measurement's folders by load, with their ``provenance.json`` where `register` or `strain`
-    wrote them; ``models`` a result's file of each, with a ``simulation.json`` beside it if it was computed here.
+    ``measured`` gives the folder of the measurement for each load, with ``provenance.json`` if `register` or `strain`
+    wrote it; ``models`` gives one result file of each model, next to ``simulation.json`` if mrstrain computed it.
     """
     compared = _compared(len(comparison.loads[0].fields.points_mm), criteria)
     uncertainty = [_uncertainty(measured)] if any(one.bands for one in comparison.loads) else []
@@ -61,7 +61,7 @@ def methods(
 
 
 def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
-    """Paragraphs on the measurement alone, the references last; ``measured`` as in `methods`."""
+    """Paragraphs on the measurement alone, with the references last; ``measured`` as in `methods`."""
     known = _sources(_errors(measured))
     return _with_references([_measured(measured), *([f"Error of the maximum shear strain: {known}"] if known else [])])
 
@@ -84,15 +84,16 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _measured(measured: Mapping[str, Path]) -> str:
-    """How displacement was measured; loads that were registered in the same way share a sentence."""
+    """How the displacement was measured; loads that were registered in the same way share a sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
         record = _record(folder / PROVENANCE)
         groups.setdefault(_registration(record) + _files(record), []).append(load)
     sentences = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
-        sentences + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
-        "E = (F^T F - I)/2, and maximum shear strain half the difference of its largest and smallest principal value."
+        sentences + " Displacement is given in the unloaded (reference) configuration. Strain is the Green-Lagrange "
+        "strain E = (F^T F - I)/2, and the maximum shear strain is half the difference between its largest and "
+        "smallest principal values."
     )
 
 
@@ -107,28 +108,28 @@ def _registration(record: Record) -> str:
         how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
         f"The loaded image was{before or ', without rigid alignment,'} registered non-rigidly {how}; seed "
-        f"{parameters.get('seed')}. Beforehand the smooth receive field was taken out of both images (N4, Tustison "
-        f"2010, as implemented in SimpleITK {versions.get('SimpleITK', '?')}, Lowekamp 2013)."
+        f"{parameters.get('seed')}. The bias field had been removed from both images (N4, Tustison 2010, as "
+        f"implemented in SimpleITK {versions.get('SimpleITK', '?')}, Lowekamp 2013)."
     )
 
 
 def _files(record: Record) -> str:
-    """What read a registration's images and wrote its maps: a sentence with a space before it, or nothing."""
+    """Software that read the images and wrote the maps of a registration: a sentence after a space, or nothing."""
     if _registration(record) == _GIVEN:
         return ""
     versions, inputs = record.get("versions", {}), record.get("inputs", {})
     formats = sorted({format_of(file["name"]) for role in _IMAGES for file in inputs.get(role, [])})
-    images = f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) written,"
-    code = f"mrstrain's own code, with nibabel {versions.get('nibabel', '?')} for the headers of NIfTI files"
+    images = f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) were written,"
+    code = f"mrstrain, with nibabel {versions.get('nibabel', '?')} for the headers of NIfTI files"
     code += f" and isal {versions.get('isal', '?')} for compression"
     if "DICOM" in formats:
         code += f", pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} "
-        code += "where its pixels are compressed in one of the JPEG formats)"
+        code += "for pixel data in a JPEG format)"
     return f" {images if formats else 'Maps were written'} by {code}."
 
 
 def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list[str]:
-    """How models were computed: those of ours by their own records, others by their files."""
+    """How models were computed: by mrstrain, from their records; by other programs, from the file formats."""
     sets, driven, others, used = list[str](), list[str](), list[str](), set[str]()
     solvers, levelled = dict[str, list[str]](), dict[str, list[str]]()
     for name, path in models.items():
@@ -153,25 +154,25 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
         *([f"{_DRIVEN} {' '.join(driven)}"] if driven else []),
         *(["The published material sets are those compiled by Trebbi 2023."] if used & _PUBLISHED else []),
         *(f"{_listed(names)}: {how}" for how, names in levelled.items()),
-        *([f"Results of other programs were taken as given: {_listed(others)}."] if others else []),
+        *([f"Models computed with other programs: {_listed(others)}."] if others else []),
     ]
 
 
 _DRIVEN = (
-    "Driven models bear no force: each node on the outside of the mesh was moved by the measured displacement, or held "
-    "where the mesh names it bone, and those inside follow from the laws."
+    "Models with measured boundary conditions: each node on the surface of the mesh was moved by the measured "
+    "displacement (nodes on the bone were fixed), and the interior was computed from the constitutive models."
 )
 
 
 def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
-    """How the measurement was simulated on a model's file."""
+    """How the measurement was simulated for a model."""
     work = path.parent.with_name(path.parent.name + "-work") / "registered" / path.stem / path.stem
     how = _registration(_record(work / PROVENANCE))
     same = how in {_registration(_record(folder / PROVENANCE)) for folder in measured.values()}
     return (
-        "the model was sent through the measurement: its displacement moved the unloaded image, freed of noise; noise "
-        "and a receive field were drawn anew; and the pair was registered"
-        + (" as the images were." if same else f" as follows. {how}")
+        "forward-model comparison: the unloaded image was denoised and warped by the displacement of the model, new "
+        "noise and a new bias field were added, and the pair was registered"
+        + (" like the measured images." if same else f" as follows. {how}")
     )
 
 
@@ -194,7 +195,7 @@ def _solver(record: Record) -> str:
             for load, own in axes.items()
             if own is not None
         )
-    contact = "bonded to the plate from the first touch" if parameters.get("taped", True) else "without friction"
+    contact = "bonded to the plate from first contact on" if parameters.get("taped", True) else "without friction"
     return (
         f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh or ''}: {parameters['element']}; "
         f"plate {parameters['plate']}; skin {contact}; fixed: {', '.join(parameters['fixed'])}; loads {loads}."
@@ -206,11 +207,11 @@ def _compared(cells: int, criteria: Criteria) -> str:
     (low, high), version = criteria.strains, versions()["mrstrain"]
     return (
         f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
-        "tetrahedra, weighted by volume, in the unloaded configuration. Intensity: area between the curves of tissue "
-        f"volume above a maximum shear strain, from {low:g} to {high:g}. Location: tissue above {levels}; "
-        "overlap (Dice 1945), distance of the centroids, 95th percentile of the Hausdorff distance, clusters of "
-        f"{criteria.least_ml:g} mL or more. "
-        "Agreement cell by cell: regression, concordance (Lin 1989), limits of agreement (Bland 1986)."
+        "tetrahedra, weighted by volume, in the unloaded configuration. Intensity was compared by the area between the "
+        f"strain-volume curves, for maximum shear strains from {low:g} to {high:g}. Location was compared for tissue "
+        f"above {levels}, in clusters of at least {criteria.least_ml:g} mL, by overlap (Dice 1945), distance of the "
+        "centroids, and 95th percentile of the Hausdorff distance. Agreement cell by cell was assessed by regression, "
+        "concordance (Lin 1989) and limits of agreement (Bland 1986)."
     )
 
 
@@ -218,21 +219,21 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
     errors = _errors(measured)
     checked = [load for load, of in errors.items() if any(r.get("factor") is not None for r in of.get("twin", []))]
     twin = checked and (
-        f"The error bars of {_listed(checked)} were checked by a synthetic warp (the unloaded image moved by what was "
-        "measured, and registered once more), and made wider where they did not hold. "
+        f"The error bars of {_listed(checked)} were checked by a synthetic warp (the unloaded image warped by the "
+        "measured displacement, and registered again), and widened where they were too narrow. "
     )
     return (
-        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) come from truths drawn by "
-        "the registration's error model: bias, spatially correlated noise. "
-        f"{_sources(errors)} {twin or ''}Displacement has no error model."
+        f"The 95 % intervals of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed from true "
+        "fields drawn with the error model of the registration (bias and spatially correlated noise). "
+        f"{_sources(errors)} {twin or ''}There is no error model of displacement."
     )
 
 
 def _sources(errors: Mapping[str, Record]) -> str:
-    """Where the registrations' error models come from, each once."""
+    """Sources of the error models of the registrations, each once."""
     return " ".join(sorted({str(one["source"]) for one in errors.values() if one.get("source")}))
 
 
 def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
-    """The record of each registration on the error of its maximum shear strain."""
+    """The record on the error of the maximum shear strain, for each registration."""
     return {load: _record(folder / QUALITY).get("error_of_max_shear", {}) for load, folder in measured.items()}

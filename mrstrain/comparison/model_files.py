@@ -1,4 +1,4 @@
-"""Files of the models by load, and how a model's files are read: mesh, unit, frame."""
+"""Files of the models by load, and the settings with which they are read: mesh, unit, frame."""
 
 import json
 import tomllib
@@ -19,15 +19,15 @@ from validate import FeResult, check_overlap, read_result
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
 SETTINGS = "model.toml"
-"""In a model's folder: mesh, unit, frame and to_image of this model alone."""
+"""File in the folder of a model with the mesh, unit, frame and to_image of this model only."""
 
 IN_IMAGE = 'unit = "mm"\nframe = "LPS"\nto_image = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n'
-"""Settings of results that lie in the image already."""
+"""Settings of results that are already in the coordinates of the image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelFile:
-    """A model's result for one load, and how it is read."""
+    """The result of a model for one load, and the settings with which it is read."""
 
     name: str
     path: Path
@@ -35,7 +35,7 @@ class ModelFile:
     to_image: FloatArray | None = None  # as in `validate.read_result`
 
     def read(self, grid: Grid) -> FeResult:
-        """The result, which has to lie in the image on this grid; errors as `read_result` and `check_overlap`."""
+        """Read the result, which must lie in the image on this grid; errors as `read_result` and `check_overlap`."""
         mesh, unit, frame = self.reading.model_mesh, self.reading.model_unit, self.reading.model_frame
         try:
             result = read_result(self.name, self.path, mesh=mesh, unit=unit, frame=frame, to_image=self.to_image)
@@ -48,20 +48,20 @@ class ModelFile:
 def model_files(
     loads: Sequence[str], models: Sequence[Path], usual: ModelReading, to_image: FloatArray | None = None
 ) -> tuple[dict[str, list[ModelFile]], list[str]]:
-    """Files of the models by load, in the order of the models; and a sentence for each that is missing."""
+    """Files of the models by load, in the order of the models; and a sentence for each missing result."""
     if not models:
-        raise InputError("No model is given: a folder with a file for each load, or a file.")
+        raise InputError("No model is given. A model is a folder with a file for each load, or a single file.")
     files: dict[str, list[ModelFile]] = {load: [] for load in loads}
     notes, taken = list[str](), set[str]()
     for place in models:
         name, chosen = _chosen(place, loads)
         if name in taken:
-            raise InputError(f"Two models are called '{name}': give their folders names of their own.")
+            raise InputError(f"Two models are named '{name}'; rename the folder of one of them.")
         if not chosen:
             lacking = f"no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}"
             if len(models) == 1:
                 raise InputError(f"{place} has {lacking}.")
-            notes.append(f"{name} has {lacking}: it is left out.")
+            notes.append(f"{name} has {lacking}; it is left out.")
             continue
         taken.add(name)
         reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
@@ -70,17 +70,17 @@ def model_files(
             if load not in chosen:
                 notes.append(f"{name} has no result for {load}.")
             elif reached.get(load, 0.0 if reached else 1.0) < 1.0:
-                notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}, which is not compared.")
+                notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}; this load is not compared.")
             else:
                 files[load].append(ModelFile(name, chosen[load], *reading))
                 if stable.get(load, 1.0) < 1.0:
                     notes.append(
-                        f"{name}, {load}: a material of it is not stable (Drucker) at the strain reached, in up to "
-                        f"{1.0 - stable[load]:.1%} of a tissue. It is compared all the same; do not trust its rank."
+                        f"{name}, {load}: a material is not stable (Drucker) at the strain reached, in up to "
+                        f"{1.0 - stable[load]:.1%} of a tissue. The model is compared, but do not trust its rank."
                     )
     files = {load: of for load, of in files.items() if of}
     if not files:
-        raise InputError("No model has a whole result for a measured load. " + " ".join(notes))
+        raise InputError("No model has a complete result for a measured load. " + " ".join(notes))
     return files, notes
 
 
@@ -91,31 +91,31 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
         }
         return place.resolve().name, files
     if not place.is_file():
-        raise InputError(f"{place}: there is no such model.")
+        raise InputError(f"{place}: no such file or folder; a model is a folder with a file for each load, or a file.")
     if place.stem in loads:
         return place.parent.resolve().name, {place.stem: place}
     if len(loads) > 1:
         raise InputError(
-            f"{place}: which load is it of? Measured are {', '.join(loads)}: call the file so, or give one load's "
-            "folder as the measurement."
+            f"{place}: it is unclear for which load this result is. Name the file after a measured load "
+            f"({', '.join(loads)}), or give the folder of one load as the measurement."
         )
     if place.stem in _outcome(place, "reached"):
-        raise InputError(f"{place} is a simulation of {place.stem}, and {loads[0]} was measured.")
+        raise InputError(f"{place} is a simulation of {place.stem}, but the measured load is {loads[0]}.")
     return place.stem, {loads[0]: place}
 
 
 def files_named(place: Path) -> list[Path]:
-    """The file of a model's settings, if it has any, and the files that they name."""
+    """The settings file of a model, if there is one, and the files that it names."""
     try:
         content = _settings(place)
-    except InputError:  # said where the model is read
+    except InputError:  # reported when the model is read
         content = {}
     named = [SETTINGS, *(content[key] for key in ("mesh", "to_image") if isinstance(content.get(key), str))]
     return [path for name in named if (path := _folder(place) / name).is_file()]
 
 
 def loads_of(place: Path, has_mesh: bool) -> list[str]:
-    """Loads for which a model's folder has a file: by the record of one of our simulations, else by file names."""
+    """Loads for which the folder of a model has a file: from mrstrain's simulation record, else from file names."""
     if reached := _outcome(place, "reached"):
         return [load for load in reached if any((place / (load + ending)).is_file() for ending in ENDINGS)]
     kept = [ending for ending in ENDINGS if ending != ".csv" or has_mesh or (place / SETTINGS).is_file()]
@@ -124,7 +124,7 @@ def loads_of(place: Path, has_mesh: bool) -> list[str]:
 
 
 def _outcome(place: Path, key: str) -> dict[str, float]:
-    """From the record of one of our simulations, by load: the fraction "reached", or "stable_share"."""
+    """The fraction "reached" or "stable_share" by load, from mrstrain's simulation record; empty without one."""
     try:
         outcome = json.loads((_folder(place) / "simulation.json").read_text(encoding="utf-8"))["outcome"]
         return {load: float(of[key]) for load, of in outcome.items()}
@@ -137,21 +137,21 @@ def _folder(place: Path) -> Path:
 
 
 def _settings(place: Path) -> dict[str, Any]:
-    """A model's settings; empty where it has none."""
+    """The settings of a model; empty if there are none."""
     settings = _folder(place) / SETTINGS
     try:
         return tomllib.loads(settings.read_text(encoding="utf-8")) if settings.is_file() else {}
     except (OSError, ValueError) as error:
-        raise InputError(f"{settings} is no TOML file ({error}).") from error
+        raise InputError(f"{settings} is not a valid TOML file ({error}).") from error
 
 
 def _reading(
     place: Path, usual: ModelReading, to_image: FloatArray | None = None
 ) -> tuple[ModelReading, FloatArray | None]:
-    """How a model is read, by its settings or else as usual."""
+    """How a model is read: by its own settings, otherwise as ``usual``."""
     folder, content = _folder(place), _settings(place)
     if unknown := sorted(set(content) - {"mesh", "unit", "frame", "to_image"}):
-        raise InputError(f"{folder / SETTINGS}: '{unknown[0]}' is none of mesh, unit, frame, to_image.")
+        raise InputError(f"{folder / SETTINGS}: unknown key '{unknown[0]}'; the keys are mesh, unit, frame, to_image.")
     own: dict[str, Any] = {f"model_{key}": str(content[key]) for key in ("unit", "frame") if key in content}
     if "mesh" in content:
         own["model_mesh"] = folder / str(content["mesh"])

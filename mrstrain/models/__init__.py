@@ -1,1 +1,1 @@
-"""`mesh`, `simulate`, `converge` and `fit`: finite-element models made, loaded and fitted."""
+"""`mesh`, `simulate`, `converge` and `fit`: meshing, simulation, mesh convergence and material fits."""

@@ -1,4 +1,4 @@
-"""`converge`: the same loads on meshes of several sizes, and what the figures tend to."""
+"""`converge`: mesh convergence, the same loads on meshes of several sizes, and the extrapolated limits."""
 
 import json
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ _FEWEST = 3
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A figure of one load: its value on each mesh, and what it tends to."""
+    """A quantity of one load: its value on each mesh, and the extrapolated limit."""
 
     load: str
     figure: str
@@ -35,18 +35,18 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Converged:
-    """What `converge` gave."""
+    """Result of `converge`."""
 
     out: Path
     sizes_mm: tuple[float, ...]
     rows: tuple[Row, ...]
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
-        lines = ["Size of the cells, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
+        """Summary, a few lines."""
+        lines = ["Cell sizes, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
         for row in self.rows:
             values, of = ", ".join(f"{v:.4g}" for v in row.values), row.limit
-            tends = f"tends to {of.limit:.4g} (order {of.order:.1f}), the finest is off by {of.error:+.1%}"
+            tends = f"limit {of.limit:.4g} (order {of.order:.1f}), error of the finest mesh {of.error:+.1%}"
             tends = tends if np.isfinite(of.limit) else "no limit can be determined"
             lines.append(f"{row.load}, {row.figure}: {values}; {tends}")
         return [*lines, f"Results: {self.out}"]
@@ -58,38 +58,39 @@ def converge(
     followed: options.Followed, loads: Sequence[LoadStep] = LOADS, directions: options.Directions,
     workers: int | None = None, progress: OnProgress | None = None,
 ) -> Converged:  # fmt: skip
-    """Mesh a label map with several edge lengths, simulate the same loads on each, and extrapolate.
+    """Mesh a label map with several edge lengths, simulate the same loads on each mesh, and extrapolate.
 
     Parameters
     ----------
     labels
         As in `mesh`.
     edges_mm : sequence of float
-        Three edge lengths or more, mm.
+        At least three edge lengths, mm.
     out : path
-        Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and ``convergence.png``. A
-        mesh that is there already and was made from the same label map is used again.
+        Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and ``convergence.png``. An
+        existing mesh that was made from the same label map is reused.
     loads, workers, progress
         As in `simulate`, with one material set.
 
     Raises
     ------
     InputError
-        If there are fewer than three edge lengths, or the region or the set does not fit; before anything is meshed.
+        If there are fewer than three edge lengths, or the region or the material set does not match the label map;
+        before anything is meshed.
     MrstrainError
         If a load is not reached on a mesh.
     """
     target, edges = Path(out), sorted(set(edges_mm), reverse=True)
     if len(edges) < _FEWEST:
-        raise InputError(f"A study of convergence needs {_FEWEST} edge lengths or more; got {len(edges)}.")
+        raise InputError(f"Mesh convergence needs at least {_FEWEST} different edge lengths; got {len(edges)}.")
     inputs = {"labels": [Path(labels)], **labelling.files}
     refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], [Path(labels), *labelling.paths])
     make_output(target)
     tell, region, material = progress or (lambda *_: None), followed.region, followed.material
     known = list(read_labels(labels, labelling.names).names.values())
     if region not in known or region in labelling.bones:
-        raise InputError(f"No soft tissue '{region}' in the label map to follow; it has {', '.join(known)}.")
-    # a set that does not fit is refused before hours of meshing
+        raise InputError(f"The label map has no soft tissue '{region}'; it has {', '.join(known)}.")
+    # an unsuitable material set is refused before hours of meshing
     material_set(material).for_regions([name for name in known if name not in labelling.bones])
     places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
     for edge, place in places.items():
@@ -110,7 +111,7 @@ def converge(
         )  # fmt: skip
         if not made.complete:
             reasons = " ".join(made.summary()[:-1])
-            raise MrstrainError(f"With edges of {edge:g} mm not every load was reached: {reasons}")
+            raise MrstrainError(f"Not every load was reached on the mesh with an edge length of {edge:g} mm. {reasons}")
         values.append(_followed(made.sets[0], region))
     on_meshes = {key: tuple(of[key] for of in values) for key in values[0]}
     rows = tuple(Row(*key, of, extrapolate(sizes, np.array(of))) for key, of in on_meshes.items())
@@ -120,7 +121,7 @@ def converge(
 
 
 def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], float]:
-    """What is followed from mesh to mesh, by load and figure: the plate's way, and percentiles of a region's shear."""
+    """Quantities compared between meshes, by load and name: plate displacement, and percentiles of the max. shear."""
     moved = {state.load.name: float(np.hypot(*state.plate_displacement_mm[:2])) for state in simulation.states}
     return {(load, "plate travel, mm"): travel for load, travel in moved.items()} | {
         (row.load, f"maximum shear strain of {region}, p{percent}"): value
@@ -131,7 +132,7 @@ def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], floa
 
 
 def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> bool:
-    """Whether a mesh is there and was made from these files as they are now, with the same bones cut out."""
+    """Whether a mesh exists and was made from the current content of these files, with the same bones cut out."""
     if not place.is_file():
         return False
     hashes = {role: [file_hash(path) for path in paths] for role, paths in inputs.items()}

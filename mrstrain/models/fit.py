@@ -1,4 +1,4 @@
-"""`fit`: parameters of a material law from a stretch-stress curve, with intervals, a picture and a material set."""
+"""`fit`: a constitutive model fitted to a stretch-stress curve, with intervals, a figure and a material set."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,40 +17,43 @@ _FILES = ["fit.json", "fit.csv", "fit.png", "material.toml"]
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """What `fit` gave, and the folder it is in."""
+    """Result of `fit`, and its folder."""
 
     out: Path
     fit: Fit
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         fitted = self.fit
         lines, doubts = [fitted.material.description], []
         for p in fitted.parameters:
             scale, unit = (1.0, "") if p.name.startswith("alpha") else (1000.0, " kPa")
             low, high = scale * p.low, scale * p.high
-            lines.append(f"  {p.name} {scale * p.value:.4g}{unit}, 95 % from {low:.4g} to {high:.4g}")
+            lines.append(f"  {p.name} {scale * p.value:.4g}{unit} (95 % interval {low:.4g} to {high:.4g})")
             unknown = f"These curves do not determine {p.name}:"
             if p.at_bound:
                 doubts.append(
-                    f"{unknown} alone they would have it lower than a law may have it, and its value is that bound. "
-                    "Measure nearer to a stretch of 1, or take a law with fewer parameters."
+                    f"{unknown} the best fit is below the smallest allowed value, which is used instead. Measure "
+                    "closer to a stretch of 1, or use a model with fewer parameters."
                 )
             elif p.low <= 0.0 <= p.high:
-                doubts.append(f"{unknown} its interval holds 0. Take a law with fewer parameters.")
+                doubts.append(f"{unknown} its interval includes 0. Use a model with fewer parameters.")
         lines.append("R2 " + ", ".join(f"{mode} {r2:.4f}" for mode, r2 in fitted.r2.items()))
         for mode, (low, high) in fitted.reached.items():
             stable = "stable from {:.3g} to {:.3g}".format(*fitted.stable[mode])
             lines.append(f"{mode}: measured at stretches {low:.3g} to {high:.3g}, {stable}")
         lines += [*_in_programs(fitted.material), *doubts]
         if not fitted.stable_where_measured:
-            lines.append("NOT stable (Drucker) at every stretch measured: take another law, or simulate less strain.")
-        lines += [f"These curves cannot tell it from: {other.description}" for other in fitted.others]
+            lines.append(
+                "WARNING: the model is not stable (Drucker) at every measured stretch. Use another model, or simulate "
+                "smaller strains."
+            )
+        lines += [f"Equally good fit to these curves: {other.description}" for other in fitted.others]
         return [*lines, f"Results: {self.out}"]
 
 
 def _in_programs(law: Material) -> list[str]:
-    """The numbers of an Ogden law as three programs want them, kPa."""
+    """The parameters of an Ogden model in the conventions of three programs, kPa."""
     if not isinstance(law, Ogden):
         return []
     pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
@@ -68,22 +71,23 @@ def _in_programs(law: Material) -> list[str]:
 def fit(
     curve: Path | str, law: str, *, out: Path | str, test: str | None = None, nu: float = 0.4999, tissue: str = "fat"
 ) -> Fitted:
-    """Fit a law to the curves of a CSV file.
+    """Fit a constitutive model to the curves of a CSV file.
 
     Parameters
     ----------
     curve : path
-        As `fe.read_curves` takes it: stretch, and nominal or true stress in kPa or MPa.
+        As in `fe.read_curves`: stretch, and nominal or true stress in kPa or MPa.
     law : str
         A name of `fe.LAWS`.
     out : path
-        Gets ``fit.json``, ``fit.csv`` (measured and fitted), ``fit.png``, and ``material.toml`` with the law.
+        Gets ``fit.json``, ``fit.csv`` (measured and fitted), ``fit.png``, and ``material.toml``, a material set with
+        the fitted model.
     test : str, optional
-        Kind of test where the file has no column for it: uniaxial, equibiaxial, pure shear.
+        Kind of test if the file has no column for it: uniaxial, equibiaxial, pure shear.
     nu : float
-        Poisson's ratio to simulate with; the fit takes the tissue as incompressible.
+        Poisson's ratio for simulations; the fit assumes that the tissue is incompressible.
     tissue : str
-        Region that the law is for, in ``material.toml``.
+        Tissue of the model in ``material.toml``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""`mesh`: a label map's soft tissues as tetrahedra, with a table of the mesh's quality and a picture."""
+"""`mesh`: tetrahedral mesh of the soft tissues of a label map, with its quality and a figure."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -19,14 +19,14 @@ _INFERIOR, _FORWARD = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Meshed:
-    """What `mesh` wrote."""
+    """Result of `mesh`."""
 
     out: Path
     mesh: TetMesh
     quality: MeshQuality
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         q = self.quality
         volumes = ", ".join(f"{name} {made:.1f} ({kept:.1f})" for name, made, kept in q.volumes_ml)
         low, middle, high = q.edge_mm
@@ -34,28 +34,28 @@ class Meshed:
             f"{q.cells} tetrahedra, {q.nodes} nodes; edges {middle:.2f} mm ({low:.2f} to {high:.2f}), dihedral angles "
             f"{q.least_angle_deg:.1f} to {q.greatest_angle_deg:.1f} degrees",
             f"Volumes, mL (in the label map): {volumes}",
-            "Facets: " + ", ".join(f"{name} {len(rows)}" for name, rows in self.mesh.facets.items()),
+            "Surface sets, faces: " + ", ".join(f"{name} {len(rows)}" for name, rows in self.mesh.facets.items()),
         ]
         lines += [
-            f"CARE: {name} differs by {made / given - 1.0:+.1%} from its volume in the label map."
+            f"WARNING: the volume of {name} differs by {made / given - 1.0:+.1%} from the label map."
             for name, made, given in q.volumes_ml
             if abs(made - given) > _CARE_VOLUME * given
         ]
         if q.least_angle_deg < _CARE_ANGLE_DEG:
-            lines.append(f"CARE: the least dihedral angle is {q.least_angle_deg:.1f} degrees.")
+            lines.append(f"WARNING: the smallest dihedral angle is {q.least_angle_deg:.1f} degrees.")
         lines += [
-            f"{share:.0%} of the cells of {name} reach through it, one cell thick; --finer makes it thicker."
+            f"{share:.0%} of the cells of {name} extend through its whole thickness; give a finer edge length there."
             for name, share in q.thin
         ]
         lines += [
-            f"CARE: {name} is meshed as soft tissue, and called as a bone is: cut it out with --bone {name}."
+            f"WARNING: {name} is meshed as soft tissue, but has the name of a bone. If it is one, add it to the bones."
             for name in self.mesh.regions
             if is_bones_name(name)
         ]
         if not any(name.casefold() == SKIN for name in self.mesh.regions):
             lines.append(
-                "CARE: no tissue is called skin, so the cut (where the label map ends) cannot be told from the outer "
-                "surface: it counts as 'skin', which the plate may touch, and there are no facets 'cut'."
+                "WARNING: no tissue is named skin, so the truncation surface (where the label map ends) is not "
+                "detected: all outer faces are in 'skin', which the plate may touch, and there is no surface set 'cut'."
             )
         return [*lines, f"Mesh: {self.out}"]
 
@@ -72,27 +72,27 @@ def mesh(
     labels : path
         As in `register`.
     out : path
-        The mesh, ending in .vtu; beside it a .json with names and quality, and a .png.
+        The mesh, ending in .vtu; next to it are written a .json with names and quality, and a .png.
     labelling, meshing, watch
         As in `fe.mesh_labels`.
 
     Raises
     ------
     InputError, OutputError, MrstrainError
-        As there; or if the output is not a .vtu, or would replace an input.
+        As `fe.mesh_labels`; or if the output is not a .vtu, or would overwrite an input.
     """
     target, files = Path(out), {"labels": [Path(labels)], **labelling.files}
     if target.suffix.lower() != ".vtu":
-        raise InputError(f"--out is the mesh itself and ends in .vtu; got {target}.")
+        raise InputError(f"The output (out) is the mesh file and must end in .vtu; got {target}.")
     written = [target.with_suffix(ending).resolve() for ending in (".vtu", ".json", ".png")]
     for path in (Path(labels), *labelling.paths):
         if path.resolve() in [target.resolve(), *written]:
-            raise OutputError(f"{path} would be replaced by a result. Choose another --out.")
+            raise OutputError(f"{path} is an input and would be overwritten. Choose another output file (out).")
     given = read_labels(labels, labelling.names)
     make_output(target.parent)
     how = meshing.model_dump()
     made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch or (lambda _: None))
-    del how["limit_s"]  # no mesh depends on it
+    del how["limit_s"]  # does not affect the mesh
     record = provenance("mesh", files, how | {"bones": list(labelling.bones)})
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))

@@ -1,4 +1,4 @@
-"""`simulate`: a mesh under a plate's loads, for one or more material parameter sets."""
+"""`simulate`: a mesh under the loads of a plate, for one or more material sets."""
 
 import json
 import re
@@ -30,12 +30,12 @@ LOADS = (
     fe.LoadStep("Load3", 15.0, 45.0), fe.LoadStep("Load4", 15.0, 12.0),
 )  # fmt: skip
 """Loads of the published experiment."""
-_EVERY_S = 30.0  # at most so often is an increment on the way to a load written, to resume from
+_EVERY_S = 30.0  # smallest time between two checkpoints within a load
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulations:
-    """What `simulate` gave: a simulation for each material parameter set, and why others failed."""
+    """Result of `simulate`: a simulation for each material set, and why others failed."""
 
     out: Path
     sets: tuple[fe.Simulation, ...]
@@ -43,11 +43,11 @@ class Simulations:
 
     @property
     def complete(self) -> bool:
-        """Whether every set carried every load, with materials that are stable at the strain reached."""
+        """Whether every load was reached with every set, and every material is stable at the strain reached."""
         return not self.failures and all(one.complete for one in self.sets)
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         lines = [line for one in self.sets for line in str(one).splitlines()]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
         return [*lines, f"Results: {self.out}"]
@@ -64,15 +64,15 @@ def simulate(
     Parameters
     ----------
     mesh : path
-        As `mesh` writes it, or made elsewhere; with facets "skin", "bone", and those that are fixed as well.
+        Written by `mesh` or another program, with the surface sets "skin", "bone", and further fixed ones.
     out : path
         Gets a folder for each set: a VTU file for each load, ``curve.csv`` (force and plate displacement),
-        ``regions.csv``, ``simulation.json`` and pictures.
+        ``regions.csv``, ``simulation.json`` and figures.
     loads : sequence of LoadStep
-        Loads with the same normal force lie on one path, in the order of their shear; by default those of the
-        published experiment.
+        Loads with the same normal force are simulated as one load path, in the order of their shear; by default those
+        of the published experiment.
     towards : mapping, optional
-        ``plate_normal`` and ``shear_direction`` of loads, by name, that go in directions of their own.
+        ``plate_normal`` and ``shear_direction``, by name, of loads that have their own directions.
     simulation, plate_options, coordinates, cores
         Their fields are given as keywords, such as ``sets=...``. See `fe.elements`, `fe.Plate` and `fe.decks`.
     progress : callable, optional
@@ -81,7 +81,7 @@ def simulate(
     Raises
     ------
     InputError
-        If the mesh, a set or a load cannot be used; before anything is computed.
+        If the mesh, a material set or a load cannot be used; before anything is computed.
     """
     place, target, tell = Path(mesh), Path(out), progress or (lambda *_: None)
     sets, limit_s, decks = simulation.sets, simulation.limit_s, simulation.decks
@@ -89,7 +89,7 @@ def simulate(
     chosen = material_sets(sets)
     towards = dict(towards or {})
     if strangers := towards.keys() - {load.name for load in loads}:
-        raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, which is none of the loads.")
+        raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, but there is no such load.")
     usual = (plate_options.plate_normal, plate_options.shear_direction)
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
     plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}
@@ -104,7 +104,7 @@ def simulate(
     for folder in (target / one.name for one in chosen):
         make_output(folder)
         fe.clear_simulation(folder)
-        for left in folder.glob(f"*{ENDING}"):  # checkpoints of these loads stay
+        for left in folder.glob(f"*{ENDING}"):  # checkpoints of the current loads are kept
             if left.name.removesuffix(ENDING) not in plates:
                 left.unlink()
     beside = [names] if (names := place.with_suffix(".json")).is_file() else []
@@ -116,12 +116,12 @@ def simulate(
     run = _Run(target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
     each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
-        raise MrstrainError("No simulation ended. " + " ".join(f"{n}: {r}" for n, r in run.failures.items()))
+        raise MrstrainError("Every simulation failed. " + " ".join(f"{n}: {r}" for n, r in run.failures.items()))
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
 
 
 def load_named(text: str) -> fe.LoadStep:
-    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N or, with mm after them, the plate's displacements."""
+    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N or, followed by mm, plate displacements."""
     name, _, asked = text.partition("=")
     found = [re.fullmatch(r"\s*([^\s]+?)\s*(mm|N)?\s*", part) for part in asked.split(",")]
     try:
@@ -134,30 +134,32 @@ def load_named(text: str) -> fe.LoadStep:
             raise ValueError("not finite numbers")
     except ValueError as failure:
         raise InputError(
-            "A load is NAME=NORMAL or NAME=NORMAL,SHEAR in N, such as Load3=15,45, or the plate's displacement in mm, "
-            f"such as Load3=15,8mm; got '{text}'."
+            "A load is written NAME=NORMAL or NAME=NORMAL,SHEAR, with forces in N, such as Load3=15,45, or plate "
+            f"displacements in mm, such as Load3=15,8mm; got '{text}'."
         ) from failure
     if not name.strip() or not re.fullmatch(r"[\w. -]+", name.strip()):
-        raise InputError(f"A load needs a name of letters, digits, dots, blanks or dashes; got '{name}'.")
+        raise InputError(f"The name of a load may have letters, digits, dots, spaces and dashes; got '{name}'.")
     return fe.LoadStep(name.strip(), **values)
 
 
 def loads_named(texts: Sequence[str] | None) -> Sequence[fe.LoadStep]:
-    """The loads that a person types, as `load_named` reads each; the published experiment's where none is typed."""
+    """Loads from their texts, each as in `load_named`; those of the published experiment if there is none."""
     return [load_named(text) for text in texts] if texts else LOADS
 
 
 def material_sets(names: Sequence[str]) -> list[fe.MaterialSet]:
-    """Material parameter sets by the names of published ones or of files; one or more are needed, each once."""
+    """Material sets by published name or file; at least one is needed, each only once."""
     chosen = [fe.material_set(name) for name in names]
     if not chosen or len({one.name for one in chosen}) < len(chosen):
-        raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, names)) or 'none'}.")
+        raise InputError(
+            f"At least one material set is needed, and each only once; got {', '.join(map(str, names)) or 'none'}."
+        )
     return chosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """Paths solved in workers, and each set's tables written as soon as its last path is there."""
+    """Solves load paths in workers, and writes the tables of a set as soon as its last path is solved."""
 
     target: Path
     jobs: Sequence[tuple[fe.MaterialSet, fe.Problem]]
@@ -199,13 +201,13 @@ class _Run:
             if self.decks:
                 made.write_decks(folder)
         except InputError as refused:
-            made = replace(made, remarks=(*made.remarks, f"No decks: {refused}"))
+            made = replace(made, remarks=(*made.remarks, f"No decks were written. {refused}"))
         made.write(folder, record=self.record(made), fields=False)
         self.done[chosen.name] = made
 
 
 def _mesh_made(place: Path) -> dict[str, object] | None:
-    """How `mesh` made a mesh, by the record that it leaves beside it; None for meshes made elsewhere."""
+    """How `mesh` made a mesh, from the record next to it; None for meshes of other programs."""
     try:
         record = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
         made = {"edge_mm": record["parameters"]["edge_mm"], "pytetwild": record["versions"]["pytetwild"]}
@@ -215,16 +217,16 @@ def _mesh_made(place: Path) -> dict[str, object] | None:
 
 
 def solve_in_folder(problem: fe.Problem, options: fe.SolverOptions, folder: Path, share: Path) -> list[fe.LoadState]:
-    """Solve one path in a worker, resuming an earlier run's in the folder if that was made from the same.
+    """Solve one load path in a worker; an earlier run in the folder is resumed if it has the same inputs.
 
-    Each load's files are there as soon as it is reached; ``share`` is a file that holds the share that is done.
+    The files of a load are written as soon as it is reached. The fraction done is written to the file ``share``.
     """
     files = _Files(problem, folder, share)
     return fe.solve(problem, options, files, files.earlier())
 
 
 class _Files(fe.Observer):
-    """Files of a path in its folder: a load's results and checkpoint when it is reached, a log of each step."""
+    """Writes the files of a load path: results and checkpoint of each load when it is reached, and a log."""
 
     def __init__(self, problem: fe.Problem, folder: Path, share: Path) -> None:
         self._problem, self._folder, self._share = problem, folder, share
@@ -234,24 +236,24 @@ class _Files(fe.Observer):
         write_whole(self._log, "")
 
     def earlier(self) -> list[fe.Checkpoint]:
-        """Where the first loads came to in an earlier run; the last may have been on its way."""
+        """Checkpoints of the first loads from an earlier run; the last load may be incomplete."""
         kept: list[fe.Checkpoint] = []
         for load in self._problem.loads:
             checkpoint = read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
             if checkpoint is None or (kept and kept[-1].reached < 1.0):
                 break
-            self.log(f"{load.name}: {checkpoint.reached:.0%} of it was there from an earlier run")
+            self.log(f"{load.name}: resumed at {checkpoint.reached:.0%} from an earlier run")
             kept.append(checkpoint)
         return kept
 
     def log(self, line: str) -> None:
         try:
-            # closed each time: there to be read meanwhile, and after a kill
+            # closed each time, so that it can be read meanwhile and after a kill
             with self._log.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
         except OSError as error:
             reason = error.strerror or error
-            raise OutputError(f"{self._log}: cannot be written ({reason}). Has the disk room?") from error
+            raise OutputError(f"{self._log} cannot be written ({reason}). Check the free disk space.") from error
 
     def progress(self, done: float) -> None:
         write_whole(self._share, f"{done:.4f}")

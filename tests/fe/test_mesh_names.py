@@ -64,7 +64,7 @@ def test_without_a_skin_the_cut_is_told_to_count_as_outer_surface(latticed, tmp_
     assert set(mesh.facets) == {"bone", "skin"}
     assert (mesh.points_mm[mesh.facets["skin"]][:, :, 2].min(axis=1) > SIDE - SHIFT_MM).any()
     told = Meshed(tmp_path, mesh, quality).summary()
-    assert [line for line in told if "no tissue is called skin" in line and "no facets 'cut'" in line]
+    assert [line for line in told if "no tissue is named skin" in line and "no surface set 'cut'" in line]
 
 
 def test_a_tissue_that_vanishes_is_refused(latticed) -> None:
@@ -96,11 +96,11 @@ def test_the_summary_warns_of_volumes_and_angles(tmp_path: Path) -> None:
     def told(fat_ml: float, angle_deg: float) -> list[str]:
         volumes = (("fat", fat_ml, 10.0), ("skin", 5.05, 5.0))
         quality = MeshQuality(48, 27, angle_deg, 150.0, (1.0, 2.0, 3.0), volumes, ())
-        return [line for line in Meshed(tmp_path, mesh, quality).summary() if line.startswith("CARE")]
+        return [line for line in Meshed(tmp_path, mesh, quality).summary() if line.startswith("WARNING")]
 
     assert told(9.7, 4.2) == [
-        "CARE: fat differs by -3.0% from its volume in the label map.",
-        "CARE: the least dihedral angle is 4.2 degrees.",
+        "WARNING: the volume of fat differs by -3.0% from the label map.",
+        "WARNING: the smallest dihedral angle is 4.2 degrees.",
     ]
     assert told(9.9, 12.0) == []
 

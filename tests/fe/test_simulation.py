@@ -142,12 +142,12 @@ def test_what_is_no_simulation_is_refused(simulation: fe.Simulation, tmp_path: P
 
 def test_notes_of_earlier_versions_are_shown_once(unreached: fe.Simulation, tmp_path: Path) -> None:
     """They are derived from the states, in the words of today, and only what was assumed is taken from the file."""
-    replace(unreached, remarks=("weak has no material law for tendon; fat's is used.",)).write(tmp_path)
+    replace(unreached, remarks=("weak has no material for tendon; that of fat is used.",)).write(tmp_path)
     record = json.loads((tmp_path / "simulation.json").read_text())
     record["notes"] += ["never was not tried: another wording.", "pressed: det F is off what the law asks for."]
     (tmp_path / "simulation.json").write_text(json.dumps(record))
     notes = fe.Simulation.read(tmp_path).notes
-    assert notes == ("weak has no material law for tendon; fat's is used.", *unreached.notes)
+    assert notes == ("weak has no material for tendon; that of fat is used.", *unreached.notes)
 
 
 def test_folders_are_made_and_names_taken_as_text(simulation: fe.Simulation, tmp_path: Path) -> None:
