@@ -1,1 +1,1 @@
-"""`init`, `check`, `run`, `cohort` and `demo`: whole studies from one file, stage by stage."""
+"""`init`, `check`, `run`, `cohort` and `demo`: complete studies from one study file, stage by stage."""

@@ -1,4 +1,4 @@
-"""The first part of a study's report: which model fits best, and how large the measured strain is."""
+"""The first part of the report of a study: the best-matching model, and the measured strain."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,23 +8,23 @@ from dvc.errors import InputError
 from dvc.report.page import Section, Table
 from validate import NOTHING, Comparison
 
-_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration; in brackets the 95 % confidence interval."
+_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration, with the 95 % confidence interval in brackets."
 _NEAREST = (
-    " Nearest model: the one with the smallest area between the curves in that tissue; a dash where no model is nearer "
-    "than one without deformation."
+    " Best match: smallest area between the strain-volume curves of model and measurement in that tissue. A dash: no "
+    "model is better than zero strain everywhere."
 )
 
 
 def answer_of(measured: Sequence[Section], compared: Sequence[Section], folder: Path) -> list[Section]:
-    """The first part of a report from the loads' sections, and that of a comparison with its folder, if there is one.
+    """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
 
-    It has a row for each load and tissue: the measured maximum shear strain, and the nearest model.
+    Its table has a row for each load and tissue: the measured maximum shear strain, and the best match.
     """
     tables = [(section.title, section.summary) for section in measured if section.summary is not None]
     if not tables:
         return list(compared)
     nearest = _nearest(folder) if compared else {}
-    model = ("nearest model",) if compared else ()
+    model = ("best match",) if compared else ()
     rows = [
         (load, *row, *(nearest.get((load, str(row[0])), "–") for _ in model)) for load, of in tables for row in of.rows
     ]
@@ -35,7 +35,7 @@ def answer_of(measured: Sequence[Section], compared: Sequence[Section], folder: 
 
 
 def _nearest(folder: Path) -> dict[tuple[str, str], str]:
-    """The model with the smallest area for each load and tissue, if it is smaller than that without deformation."""
+    """The model with the smallest area for each load and tissue, if it is below that of a model without deformation."""
     try:
         areas = [area for area in Comparison.read(folder).areas if not area.levelled]
     except InputError:

@@ -1,4 +1,4 @@
-"""`check`: every input of a study looked at, all that is wrong told at once, and what the run will take."""
+"""`check`: checks every input of a study, reports all problems at once, and estimates the cost of the run."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -26,31 +26,31 @@ from mrstrain.studies.plan import Stage, labels_to_mesh, load_steps, mesh_place,
 from validate import check_bones, check_overlap, read_thresholds
 
 _T = TypeVar("_T")
-_THERE = 0.5  # of what a label map labels: less in the image, and it lies elsewhere
+_THERE = 0.5  # smallest fraction of the labelled tissue that must lie in the image
 _P = ParamSpec("_P")
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Result of `check`: everything that prevents the study from being run, and notes."""
+    """Result of `check`: all problems that prevent the study from being run, and notes."""
 
     wrong: tuple[str, ...]
     notes: tuple[str, ...]
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
-        return [*self.notes, *(f"WRONG: {one}" for one in self.wrong)] or ["Nothing is wrong."]
+        """Summary, a few lines."""
+        return [*self.notes, *(f"ERROR: {one}" for one in self.wrong)] or ["No problem was found."]
 
 
 def check(study: Path | str, *, workers: int | None = None) -> Checked:
-    """Read every input of a study, and tell all that is wrong and what a run will take.
+    """Read every input of a study, report all problems, and estimate what a run takes.
 
     Parameters
     ----------
     study : path
         The study file, or its folder.
     workers : int, optional
-        Stages at once, for time and memory; one for each core by default.
+        Number of stages at the same time, for the estimates; by default one for each core.
 
     Raises
     ------
@@ -69,13 +69,13 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         looked.notes += (
             costs(told, planned, left, *sizes_of(told), workers or usable_cores())
             if left
-            else ["Everything is done already; a run only writes the report anew."]
+            else ["All stages are up to date; a run only rewrites the report."]
         )
     return Checked(tuple(looked.wrong), tuple(looked.notes))
 
 
 def wrong_with(study: Study, stages: Sequence[Stage]) -> tuple[str, ...]:
-    """What some of these stages would fail by, but for their loaded images: each keeps only its own load."""
+    """Problems that would make some of these stages fail, except those of loaded images, which affect one load only."""
     looked = _Look(study, stages)
     looked.at_shared()
     return tuple(looked.wrong)
@@ -83,7 +83,7 @@ def wrong_with(study: Study, stages: Sequence[Stage]) -> tuple[str, ...]:
 
 @dataclass(slots=True)
 class _Look:
-    """A look at the inputs of some stages of a study, or of all (None): what was found so far, as in `Checked`."""
+    """Checks the inputs of some stages of a study, or of all (None); collects the results of `Checked`."""
 
     study: Study
     stages: Sequence[Stage] | None
@@ -91,7 +91,7 @@ class _Look:
     notes: list[str] = field(default_factory=list)
 
     def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
-        """Result of a function; None if it raises an error, which is noted once."""
+        """Result of a function; None if it raises an error, which is recorded once."""
         try:
             return read(*given, **options)
         except (MrstrainError, OSError) as error:
@@ -100,18 +100,18 @@ class _Look:
             return None
 
     def tried_at(self, table: str, key: str, read: Callable[_P, object], *given: _P.args, **options: _P.kwargs) -> None:
-        """As `tried`, of a value whose place in the study file is told."""
+        """As `tried`, for a value whose line in the study file is reported."""
         try:
             read(*given, **options)
         except MrstrainError as error:
             self.wrong.append(f"{self.study.at(table, key)}: {error}")
 
     def asked(self, *names_or_kinds: str) -> bool:
-        """Whether a stage of these names or kinds is looked at."""
+        """Whether a stage of one of these names or kinds is checked."""
         return self.stages is None or any(stage.is_one_of(names_or_kinds) for stage in self.stages)
 
     def at_shared(self) -> tuple[Image | None, LabelMap | None]:
-        """Look at all but loaded images; return the unloaded one, and the labels on its grid."""
+        """Check everything except loaded images; return the unloaded image, and the labels on its grid."""
         study, asked = self.study, self.asked
         reference = self.tried(self.image, study.images.load0) if asked("register", "level") else None
         if reference is not None:
@@ -130,7 +130,7 @@ class _Look:
             if asked("simulate", "drive"):
                 self.at_simulations(reference, to_mesh)
         if study.models.level and asked("level") and reference is not None and reference.missing.any():
-            self.wrong.append("[models] level = true needs an unloaded image without voxels that are NaN or infinite.")
+            self.wrong.append("[models] level = true needs an unloaded image without NaN or infinite voxels.")
         if asked("compare"):
             if labels is not None and (study.models.sets or study.models.results):
                 self.tried_at("mesh", "bones", check_bones, labels, study.mesh.bones)
@@ -153,7 +153,7 @@ class _Look:
         return labels
 
     def at_loaded(self, reference: Image | None) -> None:
-        """Look at the loaded images and the repeat scan."""
+        """Check the loaded images and the repeat scan."""
         others: dict[str, str | Path] = {load: one.image for load, one in self.study.loads.items()}
         if self.study.images.repeat is not None:
             others[REPEAT] = self.study.images.repeat
@@ -165,13 +165,13 @@ class _Look:
             self.notes.append(f"{name}: {image.grid}")
             same_grid = reference is not None and reference.grid.same_as(image.grid)
             if reference is not None and same_grid and np.array_equal(reference.values, image.values, equal_nan=True):
-                self.wrong.append(f"{name} is the unloaded image: every voxel is equal.")
+                self.wrong.append(f"{name} is identical to the unloaded image (all voxels are equal).")
             twin = hashes.setdefault(hashlib.sha256(image.values.tobytes()).hexdigest(), name)
             if twin != name:
-                self.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
+                self.wrong.append(f"{name} is identical to the image of {twin} (all voxels are equal).")
 
     def at_registration(self, reference: Image | None, labels: LabelMap | None) -> None:
-        """Look at bone and masks, engine, parameters and error model."""
+        """Check bone and masks, engine, parameters and error model."""
         subject, how = self.study.subject_files, self.study.registration.located(self.study.place)
         if subject.bone_label is not None and labels is not None:
             self.tried_at("images", "bone", labels.region, subject.bone_label)
@@ -185,20 +185,21 @@ class _Look:
         model = error_model_of(engine.name) if own is None else self.tried(read_error_model, own)
         if model is None:
             self.notes.append(
-                f"{engine.name} has no error model: results will have no intervals (`mrstrain accuracy`)."
+                f"{engine.name} has no error model, so results will have no intervals; `mrstrain accuracy` makes one."
             )
         elif model.preset != engine.name:
             self.notes.append(
-                f"The error model is that of {model.preset}, and {engine.name} will be used: results will have no "
-                f"intervals (`mrstrain accuracy --preset {engine.name}` makes one)."
+                f"The error model was made for {model.preset}, but {engine.name} will be used, so results will have no "
+                f"intervals; `mrstrain accuracy --preset {engine.name}` makes one for it."
             )
 
     def at_meshing(self, labels: LabelMap) -> None:
-        """Report what `mesh` would refuse of a label map, and bones that would be meshed."""
+        """Report problems of a label map for `mesh`, and bones that would be meshed."""
         how = self.study.mesh
         self.tried(check_meshing, labels, how.edge_mm, how.bones, how.finer)
         self.notes += [
-            f"CARE: {name} will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
+            f"WARNING: {name} will be meshed as soft tissue, but has the name of a bone. If it is one, add it to "
+            "[mesh] bones."
             for name in self.soft(labels)
             if is_bones_name(name)
         ]
@@ -209,14 +210,16 @@ class _Look:
         return [name for n, name in labels.names.items() if n != 0 and n in there and name not in bones]
 
     def at_simulations(self, reference: Image | None, labels: LabelMap | None) -> None:
-        """Report what `simulate` would refuse, on a mesh made elsewhere or of these labels."""
+        """Report problems for `simulate`, on a mesh made elsewhere or from these labels."""
         study = self.study
         sets = [self.tried(material_set, study.set_given(name)) for name in study.models.sets]
         chosen = [one for one in sets if one is not None and self.asked(f"simulate {one.name}", f"drive {one.name}")]
         steps = self.tried(load_steps, study) or {}
         if forceless := [name for name in study.loads if steps and name not in steps]:
             lacking = "; ".join(study.at(f"loads.{name}", "normal_n") for name in forceless)
-            self.notes.append(f"{', '.join(forceless)}: no force ({lacking}), so measured and not simulated.")
+            self.notes.append(
+                f"{', '.join(forceless)}: measured but not simulated, because no force is given ({lacking})."
+            )
         contact = study.plate.model_dump(exclude={"plate_normal", "shear_direction"})
         made = {name: self.tried(Plate, *study.directions[name], **contact) for name in steps}
         plates = {name: plate for name, plate in made.items() if plate is not None}
@@ -238,11 +241,11 @@ class _Look:
                 self.tried(problems_of, mesh, laws[0], plates, pressed, held, study.models.element)
 
     def at_tissues(self, reference: Image | None, labels: LabelMap | None, sets: Sequence[MaterialSet]) -> None:
-        """Check that each set has a material for every meshed tissue, and that these lie where the images are."""
+        """Check that each set has a material for every meshed tissue, and that the tissues lie in the images."""
         fixed = {name.casefold() for name in self.study.models.fixed}
         if unknown := fixed - {"bone", "cut"}:
             self.wrong.append(
-                f"[models] fixed: beside the bone's surface the cut may be fixed; got {', '.join(sorted(unknown))}."
+                f"[models] fixed: only 'cut' can be fixed in addition to the bone; got {', '.join(sorted(unknown))}."
             )
         if labels is None:
             return
@@ -250,16 +253,16 @@ class _Look:
             there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
             if there < _THERE:
                 self.wrong.append(
-                    f"{self.study.path(self.study.mesh.labels)}: only {there:.0%} of what it labels lies in the "
-                    "unloaded image. A mesh has to lie where the images are."
+                    f"{self.study.path(self.study.mesh.labels)}: only {there:.0%} of the labelled tissue lies in the "
+                    "unloaded image. The label map to be meshed must be in the coordinates of the images."
                 )
         soft = self.soft(labels)
         for one in sets:
             self.tried(one.for_regions, soft)
         if "cut" in fixed and "skin" not in {name.casefold() for name in soft}:
             self.wrong.append(
-                "[models] fixed: 'cut' needs a tissue called skin in the label map, which tells it from the outer "
-                "surface."
+                "[models] fixed: 'cut' (the truncation surface) can only be detected if a tissue of the label map is "
+                "named skin."
             )
 
     def at_results(self, labels: LabelMap) -> None:

@@ -1,4 +1,4 @@
-"""Where stages run: a Dask cluster, by default of this machine's cores, or an existing one."""
+"""The Dask cluster on which stages run: the cores of this machine by default, or an existing cluster."""
 
 import logging
 import multiprocessing
@@ -26,13 +26,13 @@ _TELL_EVERY_S = 1.0
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _LOOK_EVERY_S, _LOST_S = 5.0, 120.0
 _SETTINGS = {
-    "distributed.worker.daemon": False,  # a stage starts processes of its own
+    "distributed.worker.daemon": False,  # a stage starts its own processes
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
-    "distributed.worker.memory.terminate": False,  # what needs much runs in those processes
+    "distributed.worker.memory.terminate": False,  # memory is used in those processes
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.profile.enabled": False,
-    # Dask has glibc hand every freed array back to the system, which clears its pages again for the next one: that took
+    # Dask makes glibc return every freed array to the system, which clears its pages again for the next one. That took
     # a fifth of the processor time of a study.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
     "logging.distributed": "error",
@@ -40,7 +40,7 @@ _SETTINGS = {
 
 
 class StageRunner:
-    """Runs stages, several at once; made by `cluster`."""
+    """Runs several stages at the same time; made by `cluster`."""
 
     def __init__(self, client: Client, watch: OnProgress) -> None:
         self._client = client
@@ -50,7 +50,7 @@ class StageRunner:
         client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
 
     def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, urgency: float = 0.0) -> None:
-        """Start a stage as soon as a worker is free and its lock is not held, the most urgent of those that wait."""
+        """Queue a stage; it starts when a worker and its lock are free, the most urgent of the waiting stages first."""
         key = f"{name.replace(' ', '-')}-{uuid.uuid4().hex}"
         given = self._topic, name, function, dict(arguments), str(lock)
         future = self._client.submit(_run, *given, key=key, pure=False, priority=urgency)
@@ -58,7 +58,7 @@ class StageRunner:
         future.add_done_callback(self._finished.put)
 
     def next(self) -> tuple[str, StageResult | str, float]:
-        """Wait for the next stage to end: its name, its result or why it failed, and the time it took, seconds."""
+        """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s."""
         lost_since: float | None = None
         while True:
             try:
@@ -69,7 +69,7 @@ class StageRunner:
                 lost_since = None if left else lost_since or time.monotonic()
                 if lost_since is not None and time.monotonic() - lost_since > _LOST_S:
                     future = next(iter(self._under_way))
-                    return self._under_way.pop(future), "No worker and no scheduler is left that could run it.", 0.0
+                    return self._under_way.pop(future), "The scheduler, or every worker, has stopped.", 0.0
         name = self._under_way.pop(future, "")
         if not name:  # abandoned before
             return self.next()
@@ -78,13 +78,13 @@ class StageRunner:
             return name, outcome, seconds
         error = future.exception() if future.status == "error" else None
         if error is None:
-            return name, f"The scheduler was lost, or ended it ({future.status}).", 0.0
-        advice = "Most often memory runs short: use fewer workers, or machines with more."
-        return name, f"The worker that ran it was lost more than once ({error}). {advice}", 0.0
+            return name, f"The connection to the scheduler was lost, or it cancelled the stage ({future.status}).", 0.0
+        advice = "The usual cause is too little memory: use fewer workers, or machines with more memory."
+        return name, f"The worker of this stage stopped more than once ({error}). {advice}", 0.0
 
     @property
     def busy(self) -> bool:
-        """Whether a stage is under way."""
+        """Whether a stage is running or waiting."""
         return bool(self._under_way)
 
 
@@ -94,10 +94,10 @@ def cluster(
 ) -> Iterator[StageRunner]:
     """A cluster of this machine's cores, or of the scheduler at an address (tcp://node1:8786); its stages end with it.
 
-    Progress goes to ``watch(stage, what, fraction)``; every worker must see ``places``, the folders of results.
-    InputError is raised if the scheduler cannot be reached, has no workers, or has unsuitable ones.
+    ``watch(stage, what, fraction)`` is called with the progress. Every worker must have access to ``places``, the
+    folders of results. InputError if the scheduler cannot be reached, has no workers, or has unsuitable workers.
     """
-    logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have a log of their own
+    logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have their own log
     with dask.config.set(_SETTINGS):
         if scheduler is None:
             with (
@@ -113,14 +113,15 @@ def cluster(
             client = Client(scheduler, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:
             raise InputError(
-                f"No Dask scheduler answers at {scheduler} ({error}). Start one: see docs/cluster.md."
+                f"No Dask scheduler answers at {scheduler} ({error}). Start one as described in docs/cluster.md."
             ) from error
         with client:
             try:
                 client.wait_for_workers(1, timeout=_WORKERS_S)
             except TimeoutError as none:
                 raise InputError(
-                    f"The scheduler at {scheduler} has no workers after {_WORKERS_S:.0f} s; see docs/cluster.md."
+                    f"The scheduler at {scheduler} has no workers after {_WORKERS_S:.0f} s. Start workers as described "
+                    "in docs/cluster.md."
                 ) from none
             _refuse_unfit(client, scheduler, places)
             runner = StageRunner(client, watch)
@@ -138,7 +139,7 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
         answers = client.run(_about, [str(token) for token in tokens])
     except ImportError as error:
         raise InputError(
-            f"The workers at {address} have no mrstrain ({error}). Start them in its environment."
+            f"mrstrain is not installed for the workers at {address} ({error}). Start them in its environment."
         ) from error
     finally:
         for token in tokens:
@@ -148,10 +149,10 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
         threads, there = client.nthreads().get(worker, 1), key.split(", ")
         theirs, ours = (", ".join(p for p in one if p not in rest) for one, rest in ((there, here), (here, there)))
         for unfit, why in (
-            (there != here, f"has {theirs}; here is {ours}: start workers in the same environment as here."),
-            (not seen, f"does not see {places[0]}: a study has to lie on a disk that all share."),
-            (threads > 1, f"runs {threads} stages at once; each needs a process of its own: --nthreads 1."),
-            (daemon, "may not start processes: DASK_DISTRIBUTED__WORKER__DAEMON=False in its environment lets it."),
+            (there != here, f"has {theirs}, but this machine has {ours}. Start workers in the same environment."),
+            (not seen, f"has no access to {places[0]}. A study must be on a file system that all machines share."),
+            (threads > 1, f"runs {threads} stages at the same time; each needs its own process. Use --nthreads 1."),
+            (daemon, "may not start processes. Set DASK_DISTRIBUTED__WORKER__DAEMON=False in its environment."),
         ):
             if unfit:
                 raise InputError(f"The worker {worker} {why}")
@@ -163,7 +164,7 @@ def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
 
 
 def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[StageResult | str, float]:
-    """Run a stage in a worker, under its lock; errors are returned as sentences."""
+    """Run a stage in a worker, under its lock; errors are returned as text."""
     began, reported = time.monotonic(), -_TELL_EVERY_S
     worker = get_worker()
 
@@ -181,5 +182,5 @@ def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: 
     except MrstrainError as error:
         outcome = str(error)
     except Exception:
-        outcome = "A fault of mrstrain, please report it:\n" + traceback.format_exc()
+        outcome = "This is an error in mrstrain; please report it:\n" + traceback.format_exc()
     return outcome, time.monotonic() - began

@@ -1,4 +1,4 @@
-"""`cohort`: the studies of many subjects run on one cluster, and one table and report of them all."""
+"""`cohort`: runs the studies of many subjects on one cluster, with one table and report for all."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ _TOTAL = "all loads"
 class Cohort:
     """Result of `cohort`.
 
-    The folder ``out`` has ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
+    The folder ``out`` has ``report.html``, ``cohort.csv`` (areas by subject, model and load) and ``ranking.csv``.
     """
 
     out: Path
@@ -38,16 +38,16 @@ class Cohort:
 
     @property
     def complete(self) -> bool:
-        """Whether every study is."""
+        """Whether every study is complete."""
         return all(one.complete for one in self.ran)
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
-        lines = [f"{one.study.study.name}: not complete, see {one.study.out}" for one in self.ran if not one.complete]
+        """Summary, a few lines."""
+        lines = [f"{one.study.study.name}: incomplete, see {one.study.out}" for one in self.ran if not one.complete]
         lines += [
-            f"{place}. {s.model}: {100 * s.mean:z.2f} % ({100 * s.low:z.2f} to {100 * s.high:z.2f}), nearest in "
+            f"{place}. {s.model}: {100 * s.mean:z.2f} % ({100 * s.low:z.2f} to {100 * s.high:z.2f}), best in "
             f"{s.nearest_in} of {s.subjects} subjects"
-            + ("" if place == 1 or s.differs_from_best else "; not told from the first")
+            + ("" if place == 1 or s.differs_from_best else "; not distinguishable from rank 1")
             for place, s in enumerate(self.ranking, start=1)
         ]
         return [*lines, *self.notes, f"Report: {self.out / REPORT}"]
@@ -62,27 +62,29 @@ def cohort(
     Parameters
     ----------
     studies : sequence of path
-        Study files, or their folders; each with a name of its own.
+        Study files or their folders; each with a unique name.
     out : path
-        For the cohort's report and tables; each study keeps its own results.
+        Gets the report and tables of the cohort; each study keeps its own results.
     scheduler, workers, progress
         As in `mrstrain.run`.
 
     Raises
     ------
     InputError
-        If a study cannot be read, two have one name, a material set has other laws in one than in another, or no
-        subject has been compared with a model.
+        If a study cannot be read, two studies have the same name, a material set has different parameters in two
+        studies, or no subject has been compared with a model.
     """
     read = [read_study(place) for place in studies]
     names = [study.study.name for study in read]
     if not read or len(set(names)) < len(names):
-        raise InputError(f"A cohort needs studies, each with a name of its own ([study] name); got {', '.join(names)}.")
+        raise InputError(
+            f"A cohort needs studies with different names ([study] name); got {', '.join(names) or 'none'}."
+        )
     target = Path(out)
     make_output(target)
     ranges = {study.compare.strains for study in read}
     if len(ranges) > 1:
-        raise InputError(f"The studies compare over different ranges of strain ([compare] strains): {sorted(ranges)}.")
+        raise InputError(f"The studies have different ranges of strain ([compare] strains): {sorted(ranges)}.")
     refuse_other_laws(read)
     ran = run_studies(read, scheduler=scheduler, workers=workers, progress=progress)
     by_name = dict(zip(names, ran, strict=True))
@@ -93,14 +95,14 @@ def cohort(
             "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
         )
     shares, notes = _shares(areas)
-    notes = [f"{name} is not counted: {why}" for name, why in without.items()] + notes
+    notes = [f"{name} is left out: {why}" for name, why in without.items()] + notes
     notes += unlike([by_name[name].study for name in areas])
     for name in dict.fromkeys(subject for of in shares.values() for subject in of):
         verdicts = by_name[name].verdicts.items()
         if doubtful := [load for load, verdict in verdicts if verdict.level == "distrust" and load != REPEAT]:
             notes.append(
-                f"{name}: the registration of {', '.join(doubtful)} is not to be trusted, and counts in its areas and "
-                "in the ranking. Mend it, or leave this subject out."
+                f"{name}: the verdict on the registration of {', '.join(doubtful)} is Do not trust, but its areas are "
+                "included in the ranking. Correct the registration, or leave this subject out."
             )
     try:
         ranking = rank_over_subjects(shares)
@@ -119,26 +121,27 @@ def cohort(
 
 
 def _uncounted(one: StudyRun) -> str:
-    """Why a study's areas are not ranked over; empty where they are.
+    """Why the areas of a study are not ranked; empty if they are.
 
-    A table may be there all the same: an earlier run's, of other inputs, where `compare` was not run now.
+    Its table may exist nevertheless, from an earlier run with other inputs, if `compare` was not run this time.
     """
     compared = one.outcomes.get("compare")
     if compared is None:
-        return "its study compares no model ([models] sets, results)."
+        return "its study has no model to compare ([models] sets, results)."
     return "" if compared.complete else f"compare {compared.status}. {compared.reason}".rstrip()
 
 
 def _areas(out: Path) -> list[dict[str, str]]:
-    """The areas of all soft tissue in the table of a study's results."""
+    """The areas of all soft tissue in the results of a study."""
     with (out / COMPARISON / "areas.csv").open(newline="", encoding="utf-8") as file:
         return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
 
 
 def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Model to subject to the area over all loads, over volume and range; and what is to be said of it.
+    """Normalised area over all loads, by model and subject; and notes.
 
-    With the measurement's bias taken out where every subject's error is known, else as found for all.
+    The bias of the measurement is removed if the measurement uncertainty is known in every subject; otherwise all areas
+    are as measured.
     """
     own = {
         subject: [row for row in rows if row["model"] != NOTHING and not row["model"].endswith(LEVELLED)]
@@ -154,7 +157,7 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
             found = float(row["ml"])
             scale = float(row["estimate_ml"]) / found if known and found > 0.0 else 1.0
             shares.setdefault(row["model"], {})[subject] = scale * float(row["share"])
-    notes = [] if known else ["The measurement's error is not known in every subject: areas are those found."]
+    notes = [] if known else ["The measurement uncertainty is unknown in some subjects, so all areas are as measured."]
     rare = {model: of for model, of in shares.items() if 2 * len(of) < len(areas)}
     notes += [
         f"{model} is not ranked: it has an area over all loads in only {len(of)} of {len(areas)} subjects."
@@ -164,10 +167,12 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
     for subject in areas:
         lacking = [model for model, of in shares.items() if subject not in of]
         if lacking:
-            notes.append(f"{subject} is not ranked over: it has no area over all loads of {', '.join(lacking)}.")
+            notes.append(
+                f"{subject} is not used for the ranking: it has no area over all loads of {', '.join(lacking)}."
+            )
     if len(set(loads.values())) > 1:
         told = "; ".join(f"{subject}: {', '.join(sorted(of)) or 'none'}" for subject, of in loads.items())
-        notes.append(f"Subjects have different loads, so their means are not alike: {told}.")
+        notes.append(f"Subjects have different loads, so their areas are not comparable: {told}.")
     return shares, notes
 
 
@@ -175,24 +180,25 @@ def _sections(
     ran: Mapping[str, StudyRun], shares: Mapping[str, Mapping[str, float]], ranking: Sequence[CohortRank],
     notes: Sequence[str],
 ) -> list[Section]:  # fmt: skip
-    """The report's sections: the models over all subjects, and the state of each subject."""
+    """Sections of the report: the models over all subjects, and the status of each subject."""
     order = [s.model for s in ranking] or list(shares)
     ranked = Table(
-        "Models over all subjects and loads, the nearest first",
-        ("model", "mean, %", "95 % from", "to", "least", "greatest", "nearest in", "subjects", "behind the first, %",
-         "from", "to", "told from the first"),
+        "Models over all subjects and loads, best first",
+        ("model", "mean, %", "95 % from", "to", "smallest", "largest", "best in", "subjects", "difference to rank 1, %",
+         "95 % from", "to", "significant"),
         tuple(
             (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.nearest_in,
              s.subjects, 100 * s.behind, 100 * s.behind_low, 100 * s.behind_high,
              "–" if at == 0 else "yes" if s.differs_from_best else "no")
             for at, s in enumerate(ranking)
         ),
-        "Area between volume-strain curves divided by the tissue's volume and the width of the range of strain. "
-        "Intervals of the mean are over subjects (Student's t); those of the difference to the first, subject by "
-        "subject, hold for all models at once (Tukey): a model is told from the first where it does not hold zero.",
+        "Normalised area: area between the strain-volume curves, divided by the volume of the tissue and the width of "
+        "the range of strain. Intervals of the mean are over subjects (Student's t). Intervals of the paired "
+        "difference to rank 1 are simultaneous for all models (Tukey); a difference is significant if its interval "
+        "excludes zero.",
     )  # fmt: skip
     by_subject = Table(
-        "By subject, %", ("subject", *order),
+        "Normalised area by subject, %", ("subject", *order),
         tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in ran),
     )  # fmt: skip
     drawn = Picture.drawn("Distribution over subjects", over_subjects, shares, order)

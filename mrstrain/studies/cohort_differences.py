@@ -1,4 +1,4 @@
-"""What differs between the studies of a cohort, and would make the areas of its subjects unlike."""
+"""Differences between the studies of a cohort that make the areas of its subjects incomparable."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,19 +11,19 @@ from mrstrain.options.modelling import MINUTE_S
 from mrstrain.records.provenance import file_hash
 from mrstrain.studies.file import Study
 
-_ROUNDING = 1e-9  # of a law's numbers: kPa read as MPa
-_NAMED = 3  # values, and studies to a value, that are named one by one
+_ROUNDING = 1e-9  # of material parameters: kPa converted to MPa
+_NAMED = 3  # largest number of values, and of studies per value, that are listed
 _COMPARED = {
     "registration": ("align", "bending", "volume", "chain", "twin", "allow_unknown_parameters"),
     "plate": ("taped", "turns", "gap_mm"),
     "mesh": ("edge_mm", "finer", "bones"),
     "models": ("element",),
 }
-"""Keys of the study file that are compared as they are; files, names and directions are each subject's own."""
+"""Keys of the study file whose values are compared; files, names and directions may differ between subjects."""
 
 
 def refuse_other_laws(studies: Sequence[Study]) -> None:
-    """Raise InputError, naming set and studies, where one name stands for different material parameter sets."""
+    """InputError if the same name is used for different material sets; the message names set and studies."""
     seen: dict[str, tuple[str, MaterialSet]] = {}
     for study in studies:
         for given in study.models.sets:
@@ -31,8 +31,8 @@ def refuse_other_laws(studies: Sequence[Study]) -> None:
             first, other = seen.setdefault(one.name, (study.study.name, one))
             if not _same_laws(one, other):
                 raise InputError(
-                    f"The material set '{one.name}' has other laws in {study.study.name} than in {first}: give each a "
-                    "name of its own, or both the same file."
+                    f"The material set '{one.name}' differs between {study.study.name} and {first}. Rename one of the "
+                    "sets, or use the same file in both studies."
                 )
 
 
@@ -47,20 +47,20 @@ def _same_laws(one: MaterialSet, other: MaterialSet) -> bool:
 
 
 def unlike(studies: Sequence[Study]) -> list[str]:
-    """A sentence for each way to register, mesh and solve, and each load and its force, in which subjects differ."""
+    """A sentence for each setting of registration, mesh and solver, and each load and force, that differs."""
     told: dict[str, dict[str, object]] = {}
     for study in studies:
         for key, value in _compared(study).items():
             told.setdefault(key, {})[study.study.name] = value
     return [
-        f"Subjects are not measured and simulated alike, {key} differs: {_listed(values)}."
+        f"Subjects were measured or simulated differently; {key}: {_listed(values)}."
         for key, values in told.items()
         if len(set(values.values())) > 1
     ]
 
 
 def _compared(study: Study) -> dict[str, object]:
-    """What is compared of a study, by table and key of its file."""
+    """The compared settings of a study, by table and key of its file."""
     how, models = study.registration.located(study.place), study.models
     values: dict[str, object] = {"[registration] engine": engine_of(how, labelled=True).name}
     values["[registration] files"] = ", ".join(f"{file.name} {file_hash(file)[:8]}" for file in how.paths)
@@ -68,18 +68,18 @@ def _compared(study: Study) -> dict[str, object]:
         if table != "mesh" or study.mesh.file is None:
             values |= {f"[{table}] {key}": getattr(getattr(study, table), key) for key in keys}
     if models.sets:
-        values["[mesh] file"] = "made elsewhere" if study.mesh.file else "made of the label map"
+        values["[mesh] file"] = "made elsewhere" if study.mesh.file else "made from the label map"
         values["[models] fixed"] = tuple(sorted({name.casefold() for name in models.fixed} - {BONE}))
         values["[models] limit_minutes"] = (models.limit_s or 0.0) / MINUTE_S
     values["[loads]"] = tuple(sorted(study.loads))
     for name, load in study.loads.items():
-        for key in ("normal_n", "normal_mm", "shear_n", "shear_mm"):  # no shear is a shear of nothing
+        for key in ("normal_n", "normal_mm", "shear_n", "shear_mm"):  # no shear counts as zero shear
             values[f"[loads.{name}] {key}"] = getattr(load, key) or 0.0
     return values
 
 
 def _listed(values: Mapping[str, object]) -> str:
-    """Values with the studies that have them; of many numbers their range."""
+    """Values with the studies that have them; the range if there are many numbers."""
     by_value: dict[object, list[str]] = {}
     for name, value in values.items():
         by_value.setdefault(value, []).append(name)

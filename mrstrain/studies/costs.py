@@ -1,4 +1,4 @@
-"""What the rest of a study takes: minutes, memory and room on the disk, told before it is run."""
+"""Estimated time, memory and disk space of the remaining stages of a study, reported before it is run."""
 
 import shutil
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.studies.file import Study
 from mrstrain.studies.plan import Stage, labels_to_mesh, mesh_place
 
-CARE = "CARE"
-"""Begins a line on what this machine has too little of."""
+CARE = "WARNING"
+"""Begins a line on too little memory or disk space."""
 
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
-_REGISTER_S, _MAPS_S_PER_MVOXEL = 13.0, 3.5  # beside what the engine takes (`Cost`)
-_TWIN = 1.3  # times as long again: the twin is made and registered
+_REGISTER_S, _MAPS_S_PER_MVOXEL = 13.0, 3.5  # in addition to the engine (`Cost`)
+_TWIN = 1.3  # additional time, relative: the synthetic warp is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 35.0, 1.5
 # The seven published sets took .5 to 2.6 times as long as this says, whose softest tissues have .3 to 390 kPa.
 _SOFT_MPA, _SOFTER = 0.01, 0.4
@@ -30,21 +30,22 @@ _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
 _MESH_S = 40.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
-# with borders 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells .84.
+# with strain discontinuities 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells
+# .84.
 _REGISTER_GIB = 0.65
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _OTHER_GIB = 1.5
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
-_SHAPE = 0.1  # volume of a cell over its edge cubed, as meshes come out
-_LEAST_CELLS = 0.9 * _CELLS  # thin tissues get shorter edges than are asked for
+_SHAPE = 0.1  # volume of a cell over its edge cubed, typical of the meshes
+_LEAST_CELLS = 0.9 * _CELLS  # thin tissues get shorter edges than requested
 _USUAL_VOXELS = 2e6
 _GIB = 1024.0**3
 
 
 def sizes_of(study: Study) -> tuple[float, float]:
-    """Voxels of the unloaded image, and about how many cells sets are simulated on, 0 without sets.
+    """Number of voxels of the unloaded image, and approximate number of cells for the simulations (0 without sets).
 
-    Usual numbers where a file cannot be read: the stages that read it report what is wrong with it.
+    If a file cannot be read, typical numbers are used; the stages that read the file report the error.
     """
     try:
         reference, how = read_image(study.path(study.images.load0), allow_missing=True), study.mesh
@@ -62,7 +63,7 @@ def sizes_of(study: Study) -> tuple[float, float]:
 
 
 def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
-    """About how long a stage takes on one core, seconds; voxels are those of the unloaded image, cells of the mesh."""
+    """Approximate time of a stage on one core, s; ``voxels`` of the unloaded image, ``cells`` of the mesh."""
     loads = len(study.loads)
     if stage.kind in ("register", "level"):
         cost = _cost(study)
@@ -85,7 +86,7 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
 
 
 def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
-    """About how much memory a stage takes, GiB, all its processes together; parameters as in `seconds_of`."""
+    """Approximate memory of a stage, GiB, all its processes together; parameters as in `seconds_of`."""
     if stage.kind in ("register", "level"):
         cost = _cost(study)
         return _REGISTER_GIB + cost.gib + cost.gib_per_mvoxel * voxels / 1e6
@@ -96,16 +97,16 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
 
 
 def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
-    """About how much room the results of a stage take; parameters as in `seconds_of`."""
+    """Approximate disk space for the results of a stage; parameters as in `seconds_of`."""
     images = _BYTES_VOXEL * voxels if stage.kind in ("register", "level") else 0.0
     models = {"register": 0, "level": 1, "mesh": 1}.get(stage.kind, len(study.loads))
     return images + 1e6 * _MB_MODEL * models
 
 
 def seconds_to_end(left: Sequence[Stage], seconds: Sequence[float]) -> dict[str, float]:
-    """Seconds from the start of each stage to the end of the longest row of stages that wait for one another.
+    """Seconds from the start of each stage to the end of the longest chain of stages that wait for one another.
 
-    No number of cores makes less of it, and a study ends soonest if the stage with most of it is started first.
+    More cores do not shorten it. A study ends soonest if the stage with the longest chain is started first.
     """
     to_end: dict[str, float] = {}
     for stage, own in reversed(list(zip(left, seconds, strict=True))):
@@ -115,7 +116,7 @@ def seconds_to_end(left: Sequence[Stage], seconds: Sequence[float]) -> dict[str,
 
 
 def mesh_given(study: Study) -> TetMesh:
-    """The mesh made elsewhere that a study names."""
+    """The mesh file that a study names."""
     return read_tet_mesh(mesh_place(study), unit=study.mesh.mesh_unit, frame=study.mesh.mesh_frame)
 
 
@@ -126,26 +127,26 @@ def _cost(study: Study) -> Cost:
 def costs(
     study: Study, stages: Sequence[Stage], left: Sequence[Stage], voxels: float, cells: float, workers: int
 ) -> list[str]:
-    """About how long the stages that are ``left`` take, and how much memory and disk; in sentences.
+    """Approximate time, memory and disk space of the stages that are ``left``, as sentences.
 
-    Other parameters are those of `seconds_of`; ``workers`` are the stages at once.
+    ``workers`` is the number of stages at the same time; the other parameters are as in `seconds_of`.
     """
     seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
     minutes = max(sum(seconds) / workers, *seconds_to_end(left, seconds).values()) / 60.0
     gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
-    needed = sum(gib[:workers])  # whichever of them meet
+    needed = sum(gib[:workers])  # the largest stages may run at the same time
     disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9
     free = shutil.disk_usage(study.place).free / 1e9
     lines = [
         f"To do: {len(left)} of {len(stages)} stages, about {minutes:.0f} minutes on {workers} cores, "
-        f"{needed:.1f} GiB of memory, {disk:.1f} GB on the disk ({free:.0f} GB free)."
+        f"{needed:.1f} GiB of memory, {disk:.1f} GB of disk space ({free:.0f} GB free)."
     ]
     if disk > free:
-        lines.append(f"{CARE}: the disk has too little room.")
+        lines.append(f"{CARE}: there is too little free disk space.")
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
-        smaller = "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
+        smaller = "a single stage needs more. Crop the images, use a coarser mesh, or a machine with more memory."
         advice = f"run with workers={fitting} (--workers {fitting})." if fitting else smaller
         lines.append(f"{CARE}: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
     return lines

@@ -1,4 +1,4 @@
-"""`demo`: a heel phantom of known strain, taken through a whole study, with the error by tissue."""
+"""`demo`: a complete study of a heel phantom with known strain, with the measurement error by tissue."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ _SETS = ("trebbi", "luboz", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
 _COARSE = "tissues_to_mesh_coarse"
 _COARSE_MM = 1.2  # voxels of the label map that is meshed
-_STUDY = """# The demonstration: a phantom heel, whose strain is known at every point (see the folder truth).
+_STUDY = """# Demonstration: a heel phantom whose strain is known at every point (see the folder truth).
 [study]
 name = "Phantom heel"
 seed = {seed}
@@ -43,7 +43,7 @@ names = "{to_mesh}.csv"
 [models]
 sets = {sets}
 {limit}"""
-_LIMIT = "limit_minutes = 20  # for each path of loads: Friedman's fat, the softest, would take hours\n"
+_LIMIT = "limit_minutes = 20  # for each load path; the set friedman, with the softest fat, would take hours\n"
 _LOAD = """[loads.{name}]
 image = "{name}.nii.gz"
 normal_n = {normal_n}
@@ -61,10 +61,10 @@ def demo(
     out: The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second
         run in the same folder resumes.
     seed: Seed of the phantom.
-    full: The published size: all seven material sets on some 75,000 tetrahedra; otherwise three on a coarser mesh.
+    full: All seven published material sets on about 75,000 tetrahedra; otherwise three sets on a coarser mesh.
     workers, progress: As in `mrstrain.run`.
-    Returns the summary. It is complete unless a stage failed: how much of a load a model carries is a result itself.
-    Raises OutputError if the folder holds another phantom, or other files that would be replaced.
+    Returns the summary. It is complete unless a stage failed; a load that a model does not reach is not a failure.
+    Raises OutputError if the folder contains another phantom, or other files that would be overwritten.
     """
     target = Path(out)
     _make(target, seed, full, progress)
@@ -83,18 +83,20 @@ def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> N
     if record.is_file():
         old = json.loads(record.read_text(encoding="utf-8"))["parameters"]["seed"]
         if old != seed:
-            raise OutputError(f"{target} holds the phantom of seed {old}; choose another folder (out) for seed {seed}.")
+            raise OutputError(
+                f"{target} contains the phantom of seed {old}; choose another folder (out) for seed {seed}."
+            )
     else:
         own = sorted(p.name for p in target.iterdir()) if target.is_dir() else []
         if (target / FILE).exists() or any(name.startswith(("Load", "tissues", "calcaneus")) for name in own):
             raise OutputError(
-                f"{target} holds files that the demonstration would replace; choose another folder (out)."
+                f"{target} contains files that the demonstration would overwrite; choose another folder (out)."
             )
         phantom(target, seed=seed, progress=progress)
     texts = {size: _text(seed, size) for size in (False, True)}
     study = target / FILE
     if study.exists() and study.read_text(encoding="utf-8") not in texts.values():
-        return  # changed by the user, and run as it is
+        return  # changed by the user; used unchanged
     if not full:
         grid = heel_grid(_COARSE_MM, heel.size)
         write_labels(target / f"{_COARSE}.nii.gz", labels_to_mesh(heel, labels_of(heel, grid)))
@@ -126,7 +128,7 @@ def _errors(
 
 
 def _reached(outcome: StageOutcome) -> bool:
-    """Whether a stage has a result that no failure cut short; how much of a load a model carries is a result itself."""
+    """Whether a stage has a result without a failure; a load that a model does not reach is not a failure."""
     return outcome.record is not None and not outcome.reason and not outcome.result.retry
 
 

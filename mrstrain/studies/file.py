@@ -1,4 +1,4 @@
-"""The study file: one TOML file that names a subject's images, loads, tissues and models. Nothing in it is guessed."""
+"""The study file: one TOML file with the images, loads, tissues and models of a subject. Nothing in it is guessed."""
 
 import difflib
 import re
@@ -25,10 +25,10 @@ def _seconds(minutes: float | None) -> float | None:
 
 
 def as_folder(text: str) -> str:
-    """A name that becomes a folder, as it is; ValueError where it cannot."""
+    """The name unchanged; ValueError if it cannot be the name of a folder."""
     unfit = any(c in '/\\:*?"<>|' or not c.isprintable() for c in text)
     if unfit or not text or text != text.strip() or text[0] == ".":
-        raise ValueError("a name that becomes a folder: no slash, colon or quotes, and not beginning with a dot")
+        raise ValueError("becomes the name of a folder: no slash, colon or quotes, and no dot at the beginning")
     return text
 
 
@@ -40,7 +40,7 @@ class _Part(BaseModel):
 
 
 class About(_Part):
-    """The subject's name, as in the report; the folder of the results, below the study file's own; and the seed."""
+    """Name of the subject in the report, folder of the results (below that of the study file), and random seed."""
 
     name: Annotated[str, Field(min_length=1)]
     out: str = "results"
@@ -48,27 +48,27 @@ class About(_Part):
 
 
 class Images(SubjectFiles):
-    """The unloaded image and what is known of it; paths from the study file's folder."""
+    """The unloaded image and its masks and labels; paths are relative to the folder of the study file."""
 
     load0: Path
     """Unloaded image."""
     labels: Path
-    """Label map of the tissues on it."""
+    """Label map of its tissues."""
     bone_label: str | None = Field(default=None, validation_alias="bone")
-    """Name of the label to align on, "bone" if it is not said."""
+    """Name of the bone's label, for the rigid alignment; by default "bone"."""
     bone: Path | None = Field(default=None, validation_alias="bone_mask")
-    """Or: a mask of it."""
+    """Mask of the bone, instead of the label."""
     repeat: Path | None = None
-    """A second unloaded image: the noise floor."""
+    """Second unloaded image, which measures the noise floor."""
     allow_missing: Flag = False
-    """Whether voxels that are NaN or infinite are left out, not refused."""
+    """Whether NaN and infinite voxels are left out, instead of refusing the image."""
 
 
 class Load(_Part):
-    """One loaded image, and the plate's forces, N, or in their place its travels, mm; as in `fe.LoadStep`.
+    """A loaded image, and the plate's forces, N, or instead its displacements, mm; as in `fe.LoadStep`.
 
-    Without either along the normal it is measured and not simulated. Directions, LPS, are those of the plate where none
-    are given here.
+    Without a normal force or displacement, the load is measured but not simulated. Directions, LPS, are by default
+    those of the plate.
     """
 
     image: str
@@ -84,58 +84,58 @@ class Plate(modelling.PlateOptions):
     """The plate."""
 
     plate_normal: Vector = Field(default=(0.0, 0.0, -1.0), validation_alias="normal")
-    """Its outward normal, away from the foot, LPS."""
+    """Outward normal of the plate, away from the body, LPS."""
 
 
 class Registering(RegistrationOptions):
-    """How images are registered; as the options of `register`."""
+    """Options of the registration, as those of `register`."""
 
     align: Literal["bone", "image"] = "bone"
-    """What to align rigidly first."""
+    """What is aligned rigidly before the registration."""
 
 
 class Mesh(modelling.Meshing, modelling.Labelling, modelling.MeshCoordinates):
-    """The mesh: made from the label map (or one of its own), or a file."""
+    """The mesh: made from the label map or from another one, or read from a file."""
 
     labels: Path | None = None
-    """Another label map than that of the images, such as one without toes; with ``names``."""
+    """Label map to be meshed if it is not that of the images, such as one without toes; with ``names``."""
     limit_s: Annotated[Positive, AfterValidator(_seconds)] = Field(
         default=60.0, validation_alias="limit_minutes", validate_default=True
     )
-    """Time after which meshing is given up, minutes in the file."""
+    """Stop meshing after this time, s; in the file in minutes."""
     file: Path | None = None
-    """A mesh made elsewhere, instead; its lengths in ``unit``, its axes those of ``frame``."""
+    """Mesh made elsewhere, instead; its coordinates are in ``unit`` and ``frame``."""
     mesh_unit: Unit = Field(default="mm", validation_alias="unit")
-    """Unit of that mesh's coordinates."""
+    """Unit of the coordinates of that mesh."""
     mesh_frame: Frame = Field(default="LPS", validation_alias="frame")
-    """Frame of that mesh's coordinates."""
+    """Frame of the coordinates of that mesh."""
 
     @model_validator(mode="after")
     def _of_a_file(self) -> Self:
         if self.file is None and (self.mesh_unit, self.mesh_frame) != ("mm", "LPS"):
-            raise ValueError("unit and frame are those of a mesh made elsewhere, and no 'file' names one")
+            raise ValueError("'unit' and 'frame' are only for a mesh made elsewhere, which 'file' must name")
         return self
 
 
 class Models(modelling.SimulationOptions):
-    """The models that are judged."""
+    """The models that are compared with the measurement."""
 
     sets: Names = ()
-    """Published material sets to simulate, or files of your own (.toml)."""
+    """Material sets to simulate: published names, or your own files (.toml)."""
     results: Names = ()
-    """Folders with results of other codes, a file for each load, as `compare` takes them."""
+    """Folders with results of other codes, with a file for each load, as in `compare`."""
     drive: Flag = False
-    """Also the sets driven by the measured displacement of the outside."""
+    """Also simulate the sets with measured boundary conditions (`drive`)."""
     level: Flag = False
-    """Also every simulated set sent through the measurement."""
+    """Also make the forward-model comparison of every simulated set (`level`)."""
     limit_s: Annotated[Positive | None, AfterValidator(_seconds)] = Field(
         default=None, validation_alias="limit_minutes"
     )
-    """Time after which a set's path of loads ends at its last equilibrium, minutes in the file."""
+    """End a load path after this time, s, at its last converged increment; in the file in minutes."""
 
 
 class Study(_Part):
-    """A whole study: the tables of its file, and the folder of that file, which all paths start from."""
+    """A study: the tables of its file, and the folder of that file, to which all paths are relative."""
 
     place: Path
     study: About
@@ -149,7 +149,7 @@ class Study(_Part):
     _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
 
     def at(self, table: str, key: str) -> str:
-        """A key of a table, as messages name it: with its line in the file."""
+        """A key of a table with its line in the file, for messages."""
         return _named(self._lines, table, key)[1]
 
     @property
@@ -159,12 +159,12 @@ class Study(_Part):
 
     @property
     def bone(self) -> str | None:
-        """Name of the bone's label; None where the whole image is aligned on and none is named."""
+        """Name of the bone's label; None if the whole image is aligned and no bone is named."""
         return self.images.bone_label or ("bone" if self.registration.align == "bone" else None)
 
     @property
     def directions(self) -> dict[str, tuple[Vector, Vector]]:
-        """Plate's outward normal and direction of shear under each load, LPS: its own, or those of the plate."""
+        """Outward normal of the plate and direction of shear for each load, LPS: its own, or those of [plate]."""
         return {
             name: (load.plate_normal or self.plate.plate_normal, load.shear_direction or self.plate.shear_direction)
             for name, load in self.loads.items()
@@ -172,28 +172,28 @@ class Study(_Part):
 
     @property
     def subject_files(self) -> SubjectFiles:
-        """What is known of the unloaded image; the bone by its mask, or else by its label."""
+        """Masks and labels of the unloaded image; the bone by its mask, or else by its label."""
         files = self.images.narrowed(SubjectFiles).located(self.place)
         return files if files.bone else files.model_copy(update={"bone_label": self.bone})
 
     def path(self, given: str | Path) -> Path:
-        """A path of the file, from the study's folder."""
+        """A path of the study file, relative to its folder."""
         return self.place / given
 
     def optional_path(self, given: str | Path | None) -> Path | None:
-        """A path of the file that may be left out, from the study's folder."""
+        """An optional path of the study file, relative to its folder."""
         return None if given is None else self.path(given)
 
     def set_given(self, name: str) -> str:
-        """A material set as `simulate` takes it: a file's path, or a published name."""
+        """A material set for `simulate`: the path of a file, or a published name."""
         return str(self.path(name)) if name.endswith(".toml") else name
 
 
 def read_study(path: Path | str | Study) -> Study:
-    """Read a study file (or a folder's ``study.toml``); a study that is read already is returned as it is.
+    """Read a study file (or ``study.toml`` in a folder); a `Study` is returned unchanged.
 
-    InputError lists everything that is wrong in the file, by line: what is no TOML; or missing values, unknown keys
-    with the nearest known one, and values of the wrong kind; or results outside the study's folder.
+    InputError lists all errors of the file by line: invalid TOML; missing values, unknown keys (with the closest known
+    key) and values of the wrong type; or a results folder outside the folder of the study.
     """
     if isinstance(path, Study):
         return path
@@ -203,13 +203,13 @@ def read_study(path: Path | str | Study) -> Study:
         text = place.read_text(encoding="utf-8")
         told = tomllib.loads(text)
     except FileNotFoundError as missing:
-        raise InputError(f"{place}: there is no study file; `mrstrain init FOLDER` writes one.") from missing
+        raise InputError(f"{place}: there is no such study file; `mrstrain init FOLDER` writes one.") from missing
     except tomllib.TOMLDecodeError as error:
-        raise InputError("\n  ".join([f"{place} is no TOML file:", *_faults(text.splitlines())])) from error
+        raise InputError("\n  ".join([f"{place} is not valid TOML:", *_faults(text.splitlines())])) from error
     except (OSError, ValueError) as error:
-        raise InputError(f"{place} is no TOML file ({error}).") from error
+        raise InputError(f"{place} cannot be read as a TOML file ({error}).") from error
     if "place" in told:
-        raise InputError(f"{place}: 'place' is no key of a study file; paths start from the file's own folder.")
+        raise InputError(f"{place}: unknown key 'place'; paths are always relative to the folder of the study file.")
     lines = _lines_of(text)
     try:
         study = Study(place=place.resolve().parent, **told)
@@ -219,16 +219,16 @@ def read_study(path: Path | str | Study) -> Study:
     study._lines = lines
     if study.place not in study.out.resolve().parents:
         raise InputError(
-            f"{place}: [study] out = '{study.study.out}' does not lie below the study's own folder {study.place}; "
-            "results stay with their study."
+            f"{place}: [study] out = '{study.study.out}' is not below the folder of the study ({study.place}). Choose "
+            "a folder below it."
         )
     if "repeat" in study.loads:
-        raise InputError(f"{place}: 'repeat' is kept for the repeat scan and cannot name a load.")
+        raise InputError(f"{place}: the name 'repeat' is reserved for the repeat scan; rename this load.")
     return study
 
 
 def _faults(lines: list[str]) -> list[str]:
-    """The lines that are no TOML, each found with those before left out."""
+    """Errors in the lines that are not valid TOML; each is found with the earlier ones left out."""
     faults = list[str]()
     while len(faults) < _MOST_FAULTS:
         try:
@@ -245,7 +245,7 @@ def _faults(lines: list[str]) -> list[str]:
 
 
 def _lines_of(text: str) -> dict[tuple[str, str], int]:
-    """Line of each table (its key is "") and key of a study file; behind a # only where it stands nowhere else."""
+    """Line of each table (its key is "") and key of a study file; in a comment only if it occurs nowhere else."""
     lines: dict[tuple[str, str], int] = {}
     table = ""
     for number, line in enumerate(text.splitlines(), start=1):
@@ -262,7 +262,7 @@ def _lines_of(text: str) -> dict[tuple[str, str], int]:
 
 
 def _named(lines: Mapping[tuple[str, str], int], table: str, key: str) -> tuple[int, str]:
-    """Line of a key, or else of its table (0 where neither is in the file), and how messages name it."""
+    """Line of a key, or else of its table (0 if neither is in the file), and its name in messages."""
     at = table.translate(_UNQUOTED)
     number = lines.get((at, key)) or lines.get((at, "")) or lines.get((key, "")) or 0
     return number, (f"line {number}: " if number else "") + (
@@ -276,20 +276,20 @@ def _sentence(error: Mapping[str, Any], lines: Mapping[tuple[str, str], int]) ->
     if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _fields_at(tables)
         near = difflib.get_close_matches(key, known, 1, 0.5)
-        advice = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
-        return number, f"{at} is no key here; {advice}"
+        advice = f"did you mean '{near[0]}'?" if near else f"known keys are {', '.join(known)}."
+        return number, f"{at} is an unknown key; {advice}"
     missing = error["type"] in ("missing", "missing_argument")
     return number, f"{at} is missing." if missing else f"{at}: {reason(error)}."
 
 
 def keys_of(table: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Keys that a table of the study file has, with their fields."""
+    """Keys of a table of the study file, with their fields."""
     fields = {str(info.validation_alias or name): info for name, info in table.model_fields.items()}
     return {key: info for key, info in fields.items() if key != "place"}
 
 
 def _fields_at(names: Sequence[str]) -> list[str]:
-    """Keys of the table at a path through the study's model."""
+    """Keys of the table at a path through the model of the study."""
     if names[:2] == ["mesh", "finer"]:
         return list(modelling.Finer._fields)
     model: Any = Study if not names else Load if names[0] == "loads" else Study.model_fields[names[0]].annotation

@@ -22,8 +22,8 @@ _LOADED = re.compile(r"load[ _-]?[1-9]\d*|loaded", re.IGNORECASE)
 _LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
 _TO_MESH = re.compile(r"to[ _-]?mesh", re.IGNORECASE)
 _BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
-_VARIANT = "-as-published"  # suffix of sets with an alternative reading of the published numbers
-_SOFTEST = "friedman"  # takes hours, so it has to be named explicitly
+_VARIANT = "-as-published"  # suffix of sets with another interpretation of the published parameters
+_SOFTEST = "friedman"  # takes hours, so it must be named explicitly
 _ROLES = {
     "labels": "the label map", "mesh_labels": "the label map to be meshed", "bone_mask": "the bone",
     "repeat": "the repeat scan", "load": "the load of that name",
@@ -35,7 +35,7 @@ _TABLES = (".csv", ".txt", ".label", ".ctbl")
 
 @dataclass(slots=True)
 class StudyInputs:
-    """Files of a folder by the role that their names suggest; names relative to the folder."""
+    """Files of a folder by the role that their names suggest; names are relative to the folder."""
 
     load0: str | None = None
     repeat: str | None = None
@@ -46,7 +46,7 @@ class StudyInputs:
     mesh_labels: str | None = None
     mesh_names: str | None = None
     results: list[str] = field(default_factory=list)
-    unused: dict[str, str] = field(default_factory=dict)  # images and folders, and why they are not used
+    unused: dict[str, str] = field(default_factory=dict)  # unused images and folders, with the reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,10 @@ class NewStudy:
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
-        lines += [f"Study file: {self.path}. Fill in, and take away the # at the beginning of:"]
+        lines += [f"Study file: {self.path}. Fill in the following lines, and remove the # at their beginning:"]
         file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)
         lines += [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
-        return [*lines, f"Then: mrstrain check {self.path.parent}"]
+        return [*lines, f"Next step: mrstrain check {self.path.parent}"]
 
 
 def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
@@ -75,26 +75,26 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
     Parameters
     ----------
     folder : path
-        Holds the images, the label map and its names, and results of other codes, if any, in subfolders.
+        Folder with the images, the label map and its names, and optionally results of other codes in subfolders.
     name : str
-        Name of the study in its report; must not identify a patient, and must be unique in a cohort.
+        Name of the study in its report. It must not identify a patient, and must be unique in a cohort.
 
     Raises
     ------
     InputError
         If the folder does not exist, or two files seem to be the unloaded image.
     OutputError
-        If it already has a study file.
+        If the folder already has a study file.
     """
     place = Path(folder)
     if not place.is_dir():
-        raise InputError(f"{place} is no folder.")
+        raise InputError(f"{place} is not a folder.")
     target = place / FILE
     if target.exists():
-        raise OutputError(f"{target} is there already; remove it to have it written anew.")
+        raise OutputError(f"{target} already exists; remove it to write a new one.")
     found = _look(place)
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # TOML knows no pairs of surrogates
+    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # TOML has no surrogate pairs
     source = files("mrstrain.studies") / "templates" / "study.toml.j2"
     template = environment.from_string(source.read_text(encoding="utf-8"))
     forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
@@ -113,7 +113,7 @@ def _look(place: Path) -> StudyInputs:
         if role == "load":
             taken = found.loads.setdefault(image_stem(name), name)
         elif role is None:
-            found.unused[name] = "whose name tells no role"
+            found.unused[name] = "because its name does not indicate a role"
             continue
         else:
             taken = getattr(found, role) or name
@@ -121,7 +121,7 @@ def _look(place: Path) -> StudyInputs:
         if taken != name and role == "load0":
             raise InputError(f"{place}: both {taken} and {name} seem to be the unloaded image; rename one.")
         if taken != name:
-            found.unused[name] = f"since {taken} is taken for {_ROLES[role]}"
+            found.unused[name] = f"because {taken} is used as {_ROLES[role]}"
     found.names = _table(place, found.labels)
     found.mesh_names = _table(place, found.mesh_labels)
     for inside in folders:
@@ -130,7 +130,7 @@ def _look(place: Path) -> StudyInputs:
         if any((inside / (load + ending)).is_file() for load in found.loads for ending in ENDINGS):
             found.results.append(inside.name)
         elif _role(inside.name) is not None:
-            found.unused[inside.name] = "a folder without a DICOM image in it"
+            found.unused[inside.name] = "because the folder contains no DICOM image"
     return found
 
 
@@ -138,7 +138,7 @@ def _is_volume(path: Path) -> bool:
     """Whether a file may be a whole image; a DICOM file may be a single slice."""
     try:
         return path.is_file() and (path.suffix.lower() != ".dcm" or is_multiframe(path))
-    except OSError:  # unreadable, so of no use
+    except OSError:  # unreadable
         return False
 
 
@@ -152,7 +152,7 @@ def _holds_dicom(folder: Path) -> bool:
 
 
 def _role(stem: str) -> str | None:
-    """Role that an image's name suggests: a field of `StudyInputs`, or "load"; None without one."""
+    """Role that the name of an image suggests: a field of `StudyInputs`, or "load"; None if it suggests none."""
     if _LABELS.search(stem):
         return "mesh_labels" if _TO_MESH.search(stem) else "labels"
     if _BONE.search(stem):
@@ -164,6 +164,6 @@ def _role(stem: str) -> str | None:
 
 
 def _table(place: Path, image: str | None) -> str | None:
-    """The table of label names with the name of a label map."""
+    """The table of label names that has the same file name as a label map."""
     names = [] if image is None else [image_stem(image) + ending for ending in _TABLES]
     return next((name for name in names if (place / name).is_file()), None)

@@ -1,4 +1,4 @@
-"""Records of the finished stages of a study: what each was made from and its result, in files that survive a kill."""
+"""Records of the finished stages of a study, with inputs and results, in files that survive a kill."""
 
 import hashlib
 import json
@@ -29,21 +29,21 @@ class StageRecord(BaseModel):
     )
 
     stage: str
-    key: str  # hash of everything that it was made from
+    key: str  # hash of all inputs
     made_utc: str
     seconds: float
-    files: dict[str, int]  # made by it, relative to the study's results, with their sizes in bytes
+    files: dict[str, int]  # files that it wrote, relative to the results folder, with their sizes in bytes
     result: StageResult
-    made_from: dict[str, Any] = {}  # hashes of its input files by their names, and its arguments
+    made_from: dict[str, Any] = {}  # hashes of its input files by name, and its arguments
 
     @property
     def identity(self) -> str:
-        """Identity for the stages that build on it: a result that is made again has another, even from equal inputs."""
+        """Identity for the stages that depend on it; a repeated stage gets a new identity, even with equal inputs."""
         return hashlib.sha256(f"{self.key} {self.made_utc}".encode()).hexdigest()
 
 
 class Ledger:
-    """The records of the results folder ``out`` of a study whose own folder is ``home``."""
+    """The records in the results folder ``out`` of a study in the folder ``home``."""
 
     def __init__(self, out: Path, home: Path) -> None:
         self.out, self.home = out, home
@@ -51,7 +51,7 @@ class Ledger:
         self._hashes: dict[tuple[str, int, int], str] = {}
 
     def impersonal(self, text: str, stage: Stage) -> str:
-        """A text without folders above the study, a stage's files and the home folder: they may name a person."""
+        """A text without folders above the study, files of a stage and the home folder, which may name a person."""
         folders = [place for file in stage.files for place in (file.parent, *([file] if file.is_dir() else []))]
         folders += [Path(os.path.normpath(place)) for place in folders]
         outside = [place for place in folders if not Path(os.path.normpath(place)).is_relative_to(self.home)]
@@ -66,12 +66,12 @@ class Ledger:
         return text
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
-        """Hashes of a stage's input files, and its arguments without folders, so that a moved study stays finished."""
+        """Hashes of the input files of a stage, and its arguments without folders, so that a study can be moved."""
         files = [[without_folders(str(path), self.home), self._hash(path)] for path in stage.files]
         return {"files": files, "arguments": without_folders(arguments, self.home)}
 
     def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, StageRecord]) -> str:
-        """Hash of what a stage would be made from now; ``built_on`` are records of the stages that it reads."""
+        """Hash of the current inputs of a stage; ``built_on`` are the records of the stages that it reads."""
         content = {
             "stage": stage.name, "called": [path.name for path in stage.files], **made_from,
             "built_on": {name: record.identity for name, record in sorted(built_on.items())},
@@ -89,7 +89,7 @@ class Ledger:
         return self._hashes[version]
 
     def finished(self, stage: Stage) -> StageRecord | None:
-        """The record of a stage whose files all exist, whatever it was made from; None for any other."""
+        """The record of a stage if all its files exist, whatever its inputs were; otherwise None."""
         try:
             record = StageRecord.model_validate_json(self._file(stage, _RECORD).read_bytes())
         except (OSError, ValidationError):
@@ -98,7 +98,7 @@ class Ledger:
         return record if all(place.is_file() and place.stat().st_size == size for place, size in sizes) else None
 
     def clear(self, stage: Stage, reason: str = "", *, files: bool) -> None:
-        """Mark a stage as not finished, note why, and remove its files unless it is to resume from them."""
+        """Mark a stage as not finished, record the reason, and remove its files unless it can resume from them."""
         self._file(stage, _RECORD).unlink(missing_ok=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         if reason:
@@ -112,14 +112,14 @@ class Ledger:
                 place.unlink(missing_ok=True)
 
     def reason(self, stage: Stage) -> str:
-        """Why a stage has no result; empty if it was never run."""
+        """The reason why a stage has no result; empty if it was never run."""
         try:
             return self._file(stage, _REASON).read_text(encoding="utf-8")
         except OSError:
             return ""
 
     def lock(self, stage: Stage) -> Path:
-        """Lock file of a stage while it runs: a worker of a killed run may still be at work on a cluster."""
+        """Lock file of a running stage: on a cluster, a worker of a killed run may still be running."""
         return self._file(stage, ".lock")
 
     def keep(

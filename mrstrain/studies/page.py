@@ -1,4 +1,4 @@
-"""The report of a study: verdict, models against the measurement, registrations, and how each stage ended."""
+"""The report of a study: verdict, comparison of models, registrations, and the status of each stage."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,18 +19,18 @@ from mrstrain.studies.true_error import error_against_truth
 
 
 def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutcome]) -> None:
-    """Write a study's report, one self-contained page, and ``provenance.json`` beside it."""
+    """Write the report of a study, a self-contained page, and ``provenance.json`` next to it."""
     of_loads = {name: one.result for name, one in outcomes.items() if name.startswith("register ")}
     registered = [replace(s, title=f"Registration of {s.title}") for of in of_loads.values() for s in of.sections]
     compared = [section for name, one in outcomes.items() if name not in of_loads for section in one.result.sections]
     closing = [section for one in outcomes.values() for section in one.result.closing]
-    if not closing and registered:  # the methods text, for a study whose comparison gives none on all stages
+    if not closing and registered:  # a study without a comparison gets the methods text of the measurement
         measured = [load for load in study.loads if outcomes[f"register {load}"].record is not None]
         folders = {load: study.out / REGISTRATION / load for load in measured}
         closing = [Section(METHODS, paragraphs=methods_of_registrations(folders) if folders else ())]
     record = provenance("run", {}, without_folders(study.model_dump(mode="json", exclude={"place"}), study.place))
     records = {name: outcome.record for name, outcome in outcomes.items() if outcome.record is not None}
-    # files that the results were made from, each once, with the hashes that they had then
+    # input files of the results, each once, with their hashes at that time
     files = dict.fromkeys((name, sha) for one in records.values() for name, sha in one.made_from.get("files", []))
     record["inputs"] = {"inputs": [{"name": name, "sha256": sha} for name, sha in files]}
     stages = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in records.items()}
@@ -47,7 +47,7 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
 def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdict | None:
     """The worst verdict on the registrations and on the inputs of the comparison; None without a registration.
 
-    Stages that failed or were left out do not count: see `_incomplete`.
+    Stages that failed or were left out are not considered; see `_incomplete`.
     """
     if not verdicts:
         return None
@@ -55,9 +55,9 @@ def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdic
     verdict = worst([*verdicts, *(one for one in inputs if one.level != "distrust")])
     if verdict.reasons:
         return verdict
-    images = "1 image is" if len(verdicts) == 1 else f"{len(verdicts)} images are"
-    models = " The models are judged below." if compared else ""
-    return replace(verdict, reasons=(f"The measurement: {images} registered soundly.{models}",))
+    registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
+    models = " The models are compared below." if compared else ""
+    return replace(verdict, reasons=(f"{registrations} can be trusted.{models}",))
 
 
 def _incomplete(outcomes: Mapping[str, StageOutcome]) -> list[str]:
@@ -78,7 +78,7 @@ def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:
         for lines in [(one.reason, *one.result.lines)]
     ]
     table = Table(
-        "How each stage ended", ("stage", "outcome", "seconds", "what it says"), tuple(rows),
-        "Seconds of the run that made the result, on one core beside other stages.",
+        "Stages", ("stage", "status", "time, s", "summary"), tuple(rows),
+        "Time of the run that made the result, on one core while other stages were running.",
     )  # fmt: skip
     return Section("Stages", None, (table,))

@@ -19,11 +19,11 @@ _NOT_RUN = "Not run: "
 
 @dataclass(frozen=True, slots=True)
 class StageOutcome:
-    """How a stage ended."""
+    """Outcome of a stage."""
 
     stage: str
     record: StageRecord | None  # of its result
-    reason: str = ""  # why there is no result, or why it does not match the study any more
+    reason: str = ""  # why there is no result, or why it no longer matches the study
     reused: bool = False  # the result existed already
     requested: bool = True  # the stage was among those that may be run
 
@@ -32,7 +32,7 @@ class StageOutcome:
 
     @property
     def result(self) -> StageResult:
-        """Its result, an empty one where there is none."""
+        """Its result, or an empty result if there is none."""
         return StageResult(()) if self.record is None else self.record.result
 
     @property
@@ -42,27 +42,27 @@ class StageOutcome:
 
     @property
     def complete(self) -> bool:
-        """Whether there is a complete result that matches the study as it is now."""
+        """Whether there is a complete result that matches the current study."""
         return self.record is not None and self.result.complete and not self.reason
 
     @property
     def status(self) -> str:
-        """Status in a word or two, for tables and the log."""
+        """Status for tables and the log."""
         if self.record is None:
             return "not run" if self.reason.startswith(_NOT_RUN) else "FAILED"
         if self.reason:
             return "OUT OF DATE"
-        return "in part" if not self.result.complete else "there already" if self.reused else "done"
+        return "in part" if not self.result.complete else "up to date" if self.reused else "done"
 
 
 def left_out_of(outcomes: Mapping[str, StageOutcome]) -> list[str]:
-    """A sentence on the stages that have no result only because they were not requested, if there are any."""
+    """A sentence with the stages that have no result only because they were not requested, if there are any."""
     names = [name for name, outcome in outcomes.items() if outcome.left_out]
-    return [f"Not asked for, and without a result: {', '.join(names)}."] if names else []
+    return [f"Not requested, and without a result: {', '.join(names)}."] if names else []
 
 
 class Pipeline:
-    """The stages of a study in an order that can be run, and their outcomes; ``only`` and ``force`` as in `run`."""
+    """The stages of a study in the order of dependencies, and their outcomes; ``only`` and ``force`` as in `run`."""
 
     def __init__(
         self, stages: Sequence[Stage], ledger: Ledger, *, only: Sequence[str] = (), force: Sequence[str] = ()
@@ -85,15 +85,15 @@ class Pipeline:
         return not self._only or stage.is_one_of(self._only)
 
     def settle(self) -> list[tuple[Stage, Mapping[str, Any]]]:
-        """Advance every stage as far as possible without work; return those to be run now, with their arguments."""
+        """Determine the outcome of all stages that need not be run; return those to run now, with their arguments."""
         ready = []
-        for stage in list(self._waiting.values()):  # each after those that it waits for: one pass is enough
+        for stage in list(self._waiting.values()):  # in the order of dependencies, so one pass is enough
             if any(name not in self.outcomes for name in stage.before):
                 continue
             del self._waiting[stage.name]
             try:
                 settled = self._settled(stage)
-            except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
+            except (OSError, MrstrainError) as failure:  # an input is missing or not readable
                 settled = replace(self._failed(stage, failure), requested=self._requested(stage))
             if isinstance(settled, StageOutcome):
                 self.outcomes[stage.name] = settled
@@ -102,7 +102,7 @@ class Pipeline:
         return ready
 
     def _settled(self, stage: Stage) -> StageOutcome | Mapping[str, Any]:
-        """Outcome of a stage that need not be run, or the arguments of one that has to be run now."""
+        """Outcome of a stage that need not be run, or the arguments of one that must be run now."""
         records = {name: record for name in stage.before if (record := self.outcomes[name].record) is not None}
         requested = self._requested(stage)
         if missing := _missing(stage, records):
@@ -120,18 +120,18 @@ class Pipeline:
             self._keys[stage.name] = key, made_from
             return arguments
         if kept is None:
-            reason = self.ledger.reason(stage) or f"{_NOT_RUN}it has no result, and is not among those asked for."
+            reason = self.ledger.reason(stage) or f"{_NOT_RUN}it has no result and was not requested."
         else:
-            reason = self._outdated_inputs(stage) if current else "Made from other inputs than the study names now."
+            reason = self._outdated_inputs(stage) if current else "The inputs have changed since this result was made."
         return StageOutcome(stage.name, kept, reason, reused=True, requested=requested)
 
     def _failed(self, stage: Stage, why: object) -> StageOutcome:
         return StageOutcome(stage.name, None, self.ledger.impersonal(str(why), stage))
 
     def _outdated_inputs(self, stage: Stage) -> str:
-        """Which results that a stage reads are out of date, so that it is too; empty where none is."""
+        """Names the outdated results that a stage depends on; empty if there are none."""
         outdated = [name for name in stage.before if self.outcomes[name].status == "OUT OF DATE"]
-        return f"Built on {', '.join(outdated)}, out of date." if outdated else ""
+        return f"It depends on results that are out of date: {', '.join(outdated)}." if outdated else ""
 
     def forecast(self) -> dict[str, str]:
         """What a run would do with each stage: "done already", "run", "left out", or "cannot be run" and why."""
@@ -140,7 +140,7 @@ class Pipeline:
         while ready := trial.settle():
             for stage, _ in ready:
                 anew = StageRecord(stage=stage.name, key="", made_utc="", seconds=0.0, files={}, result=StageResult(()))
-                trial.outcomes[stage.name] = StageOutcome(stage.name, anew)  # unlike any that others are built on
+                trial.outcomes[stage.name] = StageOutcome(stage.name, anew)  # different from all that others depend on
                 to_run.add(stage.name)
         return {
             name: "run" if name in to_run
@@ -151,12 +151,12 @@ class Pipeline:
         }  # fmt: skip
 
     def to_do(self) -> list[Stage]:
-        """The stages that a run would work on."""
+        """The stages that a run would execute."""
         forecast = self.forecast()
         return [stage for stage in self.stages if forecast[stage.name] == "run"]
 
     def start(self, runner: "Callable[[], StageRunner]", log: Log, prefix: str = "") -> None:
-        """Settle what can be settled, log it, and hand the stages that have to be run to the cluster."""
+        """Determine and log the outcomes that are known, and send the stages that must be run to the cluster."""
         before = set(self.outcomes)
         ready = self.settle()
         for name, outcome in self.outcomes.items():
@@ -175,7 +175,7 @@ class Pipeline:
             runner().begin(prefix + stage.name, stage.kind, arguments, lock, urgency)
 
     def end(self, name: str, result: StageResult | str, seconds: float, log: Log) -> None:
-        """Record how a stage ended that was handed to the cluster: its result, or why it failed."""
+        """Record the outcome of a stage that ran on the cluster: its result, or the reason of its failure."""
         stage = next(stage for stage in self.stages if stage.name == name)
         try:
             outcome = self._recorded(stage, result, seconds)
@@ -189,7 +189,7 @@ class Pipeline:
     def _recorded(self, stage: Stage, result: StageResult | str, seconds: float) -> StageOutcome:
         if isinstance(result, str):
             failed = self._failed(stage, result)
-            # what an earlier run or half of this one left is no result of these inputs
+            # files of an earlier or incomplete run are not a result of these inputs
             self.ledger.clear(stage, failed.reason, files=not stage.goes_on)
             return failed
         result = replace(result, lines=tuple(self.ledger.impersonal(line, stage) for line in result.lines))
@@ -198,10 +198,10 @@ class Pipeline:
 
 
 def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Mapping[str, Log]) -> None:
-    """Run what is left of several studies on one cluster.
+    """Run the remaining stages of several studies on one cluster.
 
-    Pipelines and logs are given by the prefix that tells one study's stage names from another's; a log gets a line for
-    each stage that ends. ``pool`` gives a context with a `StageRunner`, and is called only if there is work.
+    Keys of pipelines and logs are prefixes that distinguish the stage names of different studies. A log gets a line for
+    each stage that ends. ``pool`` returns a context with a `StageRunner`, and is called only if there is work.
     """
     prefixes = {prefix + stage.name: prefix for prefix, pipeline in pipelines.items() for stage in pipeline.stages}
     with ExitStack() as stack:
@@ -222,7 +222,7 @@ def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Ma
 
 
 def _missing(stage: Stage, available: Collection[str]) -> str:
-    """Which result that a stage requires is not available; empty where it can be run."""
+    """The missing result that a stage requires; empty if it can be run."""
     for name in stage.after:
         if name not in available:
             return f"{name} has no result."

@@ -1,4 +1,4 @@
-"""A study as stages: what each makes, from which files and numbers, and which others it waits for."""
+"""The stages of a study: inputs, outputs and dependencies of each."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -16,24 +16,24 @@ from mrstrain.studies.file import Study, as_folder
 from validate import LEVELLED
 
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
-"""Kinds of stages, in the order in which they come."""
+"""Kinds of stages, in their order."""
 
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One piece of work: a call of the function of its kind in `mrstrain.studies.stages`.
+    """A unit of work: a call of the function of its kind in `mrstrain.studies.stages`.
 
-    ``some`` maps an argument to stages at least one of which it needs, and ``perhaps`` to stages that it can do
-    without; the argument lists the value that stands beside each stage that succeeded.
+    ``some`` maps an argument to stages of which at least one is needed, ``perhaps`` to optional stages. The argument is
+    the list of the values of those stages that succeeded.
     """
 
     name: str  # its kind and object: "register Load1"
     arguments: Mapping[str, Any]  # plain values and paths
-    files: tuple[Path, ...]  # what it reads that no other stage makes, by content
-    gives: tuple[Path, ...]  # everything that it makes: removed before it is made again
-    after: tuple[str, ...] = ()  # stages that it cannot do without
+    files: tuple[Path, ...]  # input files that no other stage makes, compared by content
+    gives: tuple[Path, ...]  # everything that it writes; removed before it is run again
+    after: tuple[str, ...] = ()  # stages that it requires
     some: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     perhaps: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -48,7 +48,7 @@ class Stage:
 
     @property
     def goes_on(self) -> bool:
-        """Whether it finds by itself what it did before it was cut, and takes of that only what still holds."""
+        """Whether it resumes after an interruption by itself, using only results that are still valid."""
         return self.kind == "simulate"
 
     @property
@@ -59,10 +59,10 @@ class Stage:
 
 
 def plan(study: Study) -> tuple[Stage, ...]:
-    """The stages of a study, each after those that it waits for.
+    """The stages of a study, in the order of their dependencies.
 
-    InputError is raised if two material sets or models would share a folder, a load that is simulated has no force, or
-    a forward-model comparison has no bone.
+    InputError if two material sets or models would share a folder, a simulated load has no force, or a forward-model
+    comparison has no bone.
     """
     stages = _registrations(study)
     measured = {f"register {load}": load for load in study.loads}
@@ -73,7 +73,7 @@ def plan(study: Study) -> tuple[Stage, ...]:
         own = [_simulation(study, one)]
         folder = own[0].gives[0]
         if folder in models.values():
-            raise InputError(f"[models] two sets are called '{folder.name}'; each needs a name of its own.")
+            raise InputError(f"[models] sets: two material sets are named '{folder.name}'; rename one.")
         if study.models.drive:
             driven, dvc = study.out / MODELS / (folder.name + ENDING), {"dvc": study.out / REGISTRATION}
             own.append(_on_mesh(study, f"drive {folder.name}", one, driven, dvc, {"loads": measured}))
@@ -89,22 +89,22 @@ def plan(study: Study) -> tuple[Stage, ...]:
 
 
 def _refuse_mixing(study: Study, stages: Sequence[Stage]) -> None:
-    """Refuse results outside the results' folder or in one another's, and inputs in it: they would be replaced."""
+    """InputError if a result would be outside the results folder or in that of another stage, or overwrite an input."""
     out = study.out.resolve()
     made: dict[Path, str] = {}
     for stage in stages:
         for real in (place.resolve() for place in stage.gives):
             if out not in real.parents:
-                raise InputError(f"{stage.name} would write to {real}, which is not below the results {out}.")
+                raise InputError(f"{stage.name} would write to {real}, which is not below the results folder {out}.")
             near = [name for other, name in made.items() if _one_in_the_other(real, other)]
             if near:
-                raise InputError(f"{stage.name} and {near[0]} would both write to {real}: rename one.")
+                raise InputError(f"{stage.name} and {near[0]} would both write to {real}; rename one of them.")
             made[real] = stage.name
         for path in stage.files:
             if _one_in_the_other(path.resolve(), out):
                 raise InputError(
-                    f"{path} is an input and lies in the folder of the results ({out}), or that in it: results would "
-                    "replace it. Move it, or give another [study] out."
+                    f"{path} is an input, and results in {out} could overwrite it. Move the input, or choose another "
+                    "results folder ([study] out)."
                 )
 
 
@@ -142,7 +142,7 @@ def _registrations(study: Study) -> list[Stage]:
 
 
 def mesh_place(study: Study) -> Path:
-    """The mesh on which sets are simulated: one made here, or a file."""
+    """The mesh for the simulations: made by the stage "mesh", or a given file."""
     return study.out / MESH if study.mesh.file is None else study.path(study.mesh.file)
 
 
@@ -164,11 +164,11 @@ def _mesh(study: Study) -> Stage:
 def _on_mesh(
     study: Study, name: str, one: str, folder: Path, arguments: Mapping[str, Any], some: Mapping[str, Any]
 ) -> Stage:
-    """A stage that computes with a material set on the mesh."""
+    """A stage that simulates a material set on the mesh."""
     files = [study.path(one)] if one.endswith(".toml") else []
     if study.mesh.file is not None:
         mesh = mesh_place(study)
-        files += [mesh, *(p for p in (mesh.with_suffix(".json"),) if p.is_file())]  # names of regions stand beside it
+        files += [mesh, *(p for p in (mesh.with_suffix(".json"),) if p.is_file())]  # with the names of its regions
     shared = {
         "out": study.out / MODELS, "mesh": mesh_place(study), **study.mesh.narrowed(MeshCoordinates).model_dump(),
         "sets": (study.set_given(one),),
@@ -182,7 +182,7 @@ def _simulation(study: Study, one: str) -> Stage:
     try:
         as_folder(name)
     except ValueError as wrong:
-        raise InputError(f"The material set '{name}' of {one} needs {wrong}.") from wrong
+        raise InputError(f"The name of the material set '{name}' in {one} {wrong}.") from wrong
     steps = load_steps(study)
     arguments = {
         **study.models.narrowed(SimulationOptions).model_dump(), **study.plate.narrowed(PlateOptions).model_dump(),
@@ -193,9 +193,9 @@ def _simulation(study: Study, one: str) -> Stage:
 
 
 def load_steps(study: Study) -> dict[str, LoadStep]:
-    """The loads that are simulated: those with a force or a plate displacement along the normal.
+    """The simulated loads: those with a force or a plate displacement along the normal.
 
-    InputError is raised if loads have only a shear, or one force and displacement along one axis, or no load has any.
+    InputError if a load has only a shear, or both a force and a displacement along one axis, or if no load has any.
     """
     steps, lacking = {}, list[str]()
     for name, load in study.loads.items():
@@ -205,14 +205,14 @@ def load_steps(study: Study) -> dict[str, LoadStep]:
             lacking.append(name)
     if steps and not lacking:
         return steps
-    why = "A plate that shears has to press." if lacking else "No load has a force or travel to simulate sets under."
+    why = "Shear needs a normal load." if lacking else "A simulation needs at least one load with a normal load."
     places = [study.at(f"loads.{name}", "normal_n") for name in lacking or study.loads]
-    raise InputError("\n  ".join([f"{why} In the study file normal_n (N) or normal_mm is missing:", *places]))
+    raise InputError("\n  ".join([f"{why} Give normal_n (N) or normal_mm in the study file:", *places]))
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
     if study.bone is None and study.images.bone is None:
-        raise InputError("[models] level = true needs a bone, where models are at rest: [images] bone, or bone_mask.")
+        raise InputError("[models] level = true needs a rigid bone: give bone or bone_mask in [images].")
     engine, subject = study.registration.located(study.place).narrowed(EngineOptions), study.subject_files
     load0 = study.path(study.images.load0)
     arguments = {
@@ -230,7 +230,9 @@ def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, 
     elsewhere = [study.path(place) for place in study.models.results]
     taken = {place.name for place in models.values()}
     if twice := [place.name for place in elsewhere if place.name in taken]:
-        raise InputError(f"[models] a folder of results and a set are both called '{twice[0]}': rename the folder.")
+        raise InputError(
+            f"[models] a folder of results and another model are both named '{twice[0]}'; rename the folder."
+        )
     arguments = {
         "dvc": study.out / REGISTRATION, "out": study.out / COMPARISON, "labels": labels, "names": names,
         "bones": study.mesh.bones, **study.plate.narrowed(Directions).model_dump(), "towards": study.directions,

@@ -1,4 +1,4 @@
-"""`run`: a study from its file to its report; finished stages are not repeated."""
+"""`run`: runs a study from its file to its report; finished stages are not repeated."""
 
 import logging
 from collections import defaultdict
@@ -27,7 +27,7 @@ from mrstrain.studies.plan import KINDS, Stage, plan
 
 LOG = "study.log"
 _warnings = logging.getLogger("mrstrain.studies")
-_NOTHING = ("nothing",)  # may be run: every stage is taken as it is
+_NOTHING = ("nothing",)  # no stage may be run
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class StudyRun:
 
     @property
     def complete(self) -> bool:
-        """Whether every requested stage has a complete result that matches the study as it is now."""
+        """Whether every requested stage has a complete result that matches the current study."""
         return all(outcome.complete for outcome in self.outcomes.values() if outcome.requested)
 
     @property
@@ -53,7 +53,7 @@ class StudyRun:
         }
 
     def summary(self) -> list[str]:
-        """Summary, a few lines: what is incomplete or doubtful, the comparison, and where log and report are."""
+        """Summary, a few lines: incomplete stages, doubtful registrations, the comparison, and log and report files."""
         lines = []
         for name, outcome in self.outcomes.items():
             if outcome.left_out:
@@ -66,7 +66,7 @@ class StudyRun:
         if comparison := self.outcomes.get("compare"):
             lines += comparison.result.lines
         reused = sum(outcome.reused and outcome.record is not None for outcome in self.outcomes.values())
-        stages = f"{len(self.outcomes)} stages, {reused} of them there already. Log: {self.study.out / LOG}"
+        stages = f"{len(self.outcomes)} stages, {reused} of them reused. Log: {self.study.out / LOG}"
         return [*lines, *left_out_of(self.outcomes), stages, f"Report: {self.study.out / REPORT}"]
 
 
@@ -81,30 +81,31 @@ def run(
     study : path or Study
         The study file, or its folder.
     only : sequence of str
-        Names or kinds of stages ("register", "simulate trebbi") that may be run; the others are taken as they are.
+        Names or kinds of stages ("register", "simulate trebbi") that may be run; the others are not changed.
     force : sequence of str
         Names or kinds of stages that are run even if they are finished.
     scheduler : str, optional
-        Address of a Dask scheduler whose workers see the study's folder; by default this machine's cores are used.
+        Address of a Dask scheduler whose workers have access to the folder of the study; by default the cores of this
+        machine are used.
     workers : int, optional
-        Stages at once on this machine; by default one for each core.
+        Number of stages at the same time on this machine; by default one for each core.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
     Returns
     -------
     StudyRun
-        Outcome of every stage; the log and the report name a failed stage as well.
+        Outcome of every stage; failed stages are also listed in the log and the report.
 
     Raises
     ------
     InputError
-        Before anything is run: if the study cannot be read, a file is missing, or a stage that is to be run would fail
-        because of the study file or the files that it names (a damaged loaded image fails only its own stage).
+        Before anything is run: if the study cannot be read, a file is missing, or a stage to be run would fail because
+        of the study file or the files that it names. (A damaged loaded image makes only its own stage fail.)
     ParameterError
         If both a scheduler and a number of workers are given.
     OutputError
-        If another run is at work in the same folder, or it cannot be written to.
+        If another run uses the same folder, or it cannot be written to.
     """
     return run_studies(
         [read_study(study)], only=only, force=force, scheduler=scheduler, workers=workers, progress=progress
@@ -115,11 +116,11 @@ def run_studies(
     studies: Sequence[Study], *, only: Sequence[str] = (), force: Sequence[str] = (), scheduler: str | None = None,
     workers: int | None = None, progress: OnProgress | None = None,
 ) -> list[StudyRun]:  # fmt: skip
-    """Run studies of different names on one cluster, each as `run` does; what cannot be run is refused before any."""
+    """Run studies of different names on one cluster, each as in `run`; errors are raised before any of them is run."""
     if scheduler is not None and workers is not None:
         raise ParameterError(
-            f"workers={workers} (--workers {workers}) is for this machine's cores; the scheduler at {scheduler} has "
-            "workers of its own. Give one of the two."
+            f"workers={workers} (--workers {workers}) applies to this machine, but the scheduler at {scheduler} has "
+            "its own workers. Give only one of the two."
         )
     named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
     pipelines, to_do = _planned(named, only, force)
@@ -160,7 +161,7 @@ def run_studies(
 
 
 def _tell(lines: Sequence[str], log: Log) -> None:
-    """Log what a run takes; what this machine has too little of is said aloud."""
+    """Log the estimates for a run; warnings also go to the logger."""
     for line in lines:
         log(line)
         if line.startswith(CARE):
@@ -170,36 +171,36 @@ def _tell(lines: Sequence[str], log: Log) -> None:
 def _planned(
     studies: Mapping[str, Study], only: Sequence[str], force: Sequence[str]
 ) -> tuple[dict[str, Pipeline], dict[str, list[Stage]]]:
-    """Pipeline of each study and the stages to do; what cannot be run is refused, with all that is wrong."""
+    """Pipeline of each study and the stages to do; InputError with all problems if a study cannot be run."""
     planned = {name: plan(study) for name, study in studies.items()}
     for stages in planned.values():
         refuse_unknown(stages, only, force)
     files = dict.fromkeys(path for stages in planned.values() for stage in stages for path in stage.files)
     if missing := [path for path in files if not path.exists()]:
-        raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
+        raise InputError("These files of the study do not exist:\n" + "\n".join(f"  {path}" for path in missing))
     pipelines = {
         name: Pipeline(planned[name], Ledger(study.out, study.place), only=only, force=force)
         for name, study in studies.items()
     }
     to_do = {name: pipeline.to_do() for name, pipeline in pipelines.items()}
-    # what would fail, hours later, for a reason that can be known beforehand
+    # problems that would otherwise make a stage fail hours later
     faults = [f"{one.study.name}: {wrong}" for name, one in studies.items() for wrong in wrong_with(one, to_do[name])]
     if faults:
-        raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(faults))
+        raise InputError("The study cannot be run (details: `mrstrain check`):\n  " + "\n  ".join(faults))
     return pipelines, to_do
 
 
 @dataclass(slots=True, eq=False)
 class _TotalProgress:
-    """Progress of all stages together, weighted by the seconds that each to be run is expected to take."""
+    """Overall progress, weighted by the expected time of each stage to be run."""
 
     report: OnProgress
-    stages: str  # how many there are, in words
+    stages: str  # their number, as text
     seconds: dict[str, float] = field(default_factory=dict)
     ended_s: float = 0.0
 
     def also(self, log: Log, prefix: str) -> Log:
-        """A log that reports progress as well, for each stage that a line says has ended."""
+        """A log that also reports progress for each line on a stage that has ended."""
 
         def line(text: str) -> None:
             log(text)
@@ -213,13 +214,13 @@ class _TotalProgress:
 
 
 def report(study: Path | str | Study) -> StudyRun:
-    """Write a study's report again from the existing results, without running anything; InputError without any."""
+    """Rewrite the report of a study from the existing results, without running a stage; InputError without results."""
     study = read_study(study)
     pipeline = Pipeline(plan(study), Ledger(study.out, study.place), only=_NOTHING)
     pipeline.settle()
     outcomes = pipeline.in_order()
     if all(outcome.record is None for outcome in outcomes.values()):
-        raise InputError(f"{study.out} has no results yet: `mrstrain run` makes them.")
+        raise InputError(f"{study.out} has no results yet; run the study first (`mrstrain run`).")
     with _alone(study.out):
         write_run_report(study.out / REPORT, study, outcomes)
     return StudyRun(study, outcomes)
@@ -231,15 +232,15 @@ def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequ
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
-    """Refuse names of no stage or kind of stage, and to force a stage that is not to be run."""
+    """InputError for unknown names of stages, and for forced stages that may not be run."""
     known = [*(stage.name for stage in stages), *KINDS]
     for name in (*only, *force):
         if name not in known:
-            raise InputError(f"No stage is called '{name}'. There are: {', '.join(known)}.")
+            raise InputError(f"There is no stage '{name}'. The stages are: {', '.join(known)}.")
     for name in force if only else ():
         forced = [stage for stage in stages if name in (stage.name, stage.kind)]
         if forced and not any({stage.name, stage.kind} & {*only} for stage in forced):
-            raise InputError(f"force ({name}) makes nothing anew: only ({', '.join(only)}) leaves it out.")
+            raise InputError(f"force ({name}) has no effect, because only ({', '.join(only)}) excludes this stage.")
 
 
 @contextmanager
@@ -252,7 +253,7 @@ def _alone(out: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout as taken:
         raise OutputError(
-            f"{out}: another run is at work here. Wait for its end, or give another [study] out."
+            f"{out}: another run uses this folder. Wait until it ends, or choose another results folder ([study] out)."
         ) from taken
     try:
         yield
@@ -261,6 +262,6 @@ def _alone(out: Path) -> Iterator[None]:
 
 
 def _log(path: Path, text: str) -> None:
-    """Append a line to a file, with its time."""
+    """Append a line with the current time to a file."""
     with path.open("a", encoding="utf-8") as file:
         file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S}Z {text}\n")

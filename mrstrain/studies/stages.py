@@ -1,7 +1,7 @@
-"""The stages of a study, each a function of plain values and paths: what a worker runs, here or on another machine.
+"""The stages of a study, each a function of plain values and paths that a worker runs on this or another machine.
 
-Every function takes ``tell(stage, fraction)`` and what the plan gave it, writes its results whole, and returns what the
-study's report and log say of it.
+Every function takes ``tell(stage, fraction)`` and the arguments from the plan, writes its results completely, and
+returns its contribution to the report and the log.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,9 +22,9 @@ class StageResult:
 
     lines: tuple[str, ...]  # summary
     sections: tuple[Section, ...] = ()  # of the study's report
-    closing: tuple[Section, ...] = ()  # at the report's end: how to read its part
-    complete: bool = True  # everything was reached; False for a model that carried a part of its load
-    retry: bool = False  # a part failed in a way that may not recur: it is run again next time
+    closing: tuple[Section, ...] = ()  # at the end of the report: how to read its part
+    complete: bool = True  # False if a model reached only a part of its load
+    retry: bool = False  # a part failed in a way that may not recur, so it is run again next time
 
     @property
     def verdicts(self) -> list[Verdict]:
@@ -33,7 +33,7 @@ class StageResult:
 
 
 def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **options: Any) -> StageResult:
-    """One loaded image against the unloaded one; as `mrstrain.measurement.register.register_one`."""
+    """Register one loaded image; as `mrstrain.measurement.register.register_one`."""
     from mrstrain.measurement.register import register_one
 
     case = register_one(load0, load, repeat=next(iter(repeat), None), tell=tell, **options)
@@ -41,14 +41,14 @@ def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **o
 
 
 def mesh(tell: Tell, *, labels: Path, **options: Any) -> StageResult:
-    """A label map's soft tissue as tetrahedra; as `mrstrain.mesh`."""
+    """Mesh the soft tissue of a label map; as `mrstrain.mesh`."""
     from mrstrain.models.mesh import mesh as run
 
     return StageResult(tuple(run(labels, watch=lambda share: tell("meshing", share), **options).summary()))
 
 
 def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **options: Any) -> StageResult:
-    """One material set under all loads; as `mrstrain.simulate`."""
+    """Simulate one material set under all loads; as `mrstrain.simulate`."""
     from fe import LoadStep
     from mrstrain.models.simulate import simulate as run
 
@@ -64,7 +64,7 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
 
 
 def drive(tell: Tell, *, sets: Sequence[str], **options: Any) -> StageResult:
-    """One material set whose outside goes where it was measured; as `mrstrain.drive`."""
+    """Simulate one material set with measured boundary conditions; as `mrstrain.drive`."""
     with Worker(threads=1) as worker:
         return worker.run(f"driving {sets[0]}", _driven, {"sets": sets, **options})
 
@@ -77,7 +77,7 @@ def _driven(options: dict[str, Any]) -> StageResult:
 
 
 def level(tell: Tell, *, load0: Path, model: Path, load: str, **options: Any) -> StageResult:
-    """One model's load sent through the measurement; as `mrstrain.level`."""
+    """Forward-model comparison of one model and load; as `mrstrain.level`."""
     from mrstrain.comparison.level import level as run
 
     done = run(load0, model, loads=[load], threads=1, progress=lambda _, *stage: tell(*stage), **options)
@@ -85,7 +85,7 @@ def level(tell: Tell, *, load0: Path, model: Path, load: str, **options: Any) ->
 
 
 def compare(tell: Tell, **options: Any) -> StageResult:
-    """All models against the measurement; as `mrstrain.compare`, on all cores, since a study ends with it."""
+    """Compare all models with the measurement; as `mrstrain.compare`, on all cores, since it is the last stage."""
     from mrstrain.comparison.compare import compare as run
 
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]

@@ -1,4 +1,4 @@
-"""Error of a study's measurement against the known strain of a phantom: table and section of the report."""
+"""Error of a measurement relative to the known strain of a phantom: table and section of the report."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,13 @@ _COLUMNS = ("load", "tissue", "true max. shear, median", "p95", "RMSE", "bias", 
 
 
 def write_errors(path: Path, errors: Mapping[str, Sequence[TissueError]], outcomes: Mapping[str, StageOutcome]) -> None:
-    """Write the error of each load by tissue, with the time at which its registration was made."""
+    """Write the error of each load by tissue, with the time of its registration."""
     rows = [(load, _made(outcomes, load), *map(str, astuple(one))) for load, of in errors.items() for one in of]
     write_csv(path, _HEADER, rows)
 
 
 def read_errors(path: Path, outcomes: Mapping[str, StageOutcome]) -> dict[str, tuple[TissueError, ...]]:
-    """Errors that `write_errors` wrote, for the loads whose registration has not been made again since."""
+    """Read the errors of `write_errors`, for the loads that have not been registered again since."""
     errors: dict[str, tuple[TissueError, ...]] = {}
     for row in _rows(path):
         if row[_MADE] and row[_MADE] == _made(outcomes, row["load"]):
@@ -36,7 +36,7 @@ def read_errors(path: Path, outcomes: Mapping[str, StageOutcome]) -> dict[str, t
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    """Rows of such a table; none for any other file."""
+    """Rows of an error table; none if the file is something else."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as file:
@@ -45,9 +45,9 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def error_against_truth(study: Study, outcomes: Mapping[str, StageOutcome]) -> list[Section]:
-    """Section of the report on the error table in the study's folder; none without one.
+    """Section of the report with the error table in the folder of the study; none without a table.
 
-    Loads whose registration was made again since are left out, because their error is not known.
+    Loads that were registered again since are left out, because their error is unknown.
     """
     rows = _rows(study.place / TABLE)
     if not rows:
@@ -58,17 +58,17 @@ def error_against_truth(study: Study, outcomes: Mapping[str, StageOutcome]) -> l
     )
     note = "Displacement in mm. The calcaneus and the ankle bones are rigid, so their true shear is zero."
     if old := dict.fromkeys(row["load"] for row in rows if row["load"] not in known):
-        note += f" Registered again since, so not known: {', '.join(old)}; run `mrstrain demo` to compute it."
+        note += f" Unknown for {', '.join(old)}, registered again since; `mrstrain demo` computes the error."
     table = Table("Error of max. shear and displacement, by load and tissue", _COLUMNS, figures, note)
     text = (
-        "These images show a phantom whose strain is known at every point, so the measurement below can be compared "
-        "with the truth. Real images have no such table: rely on the verdict, the intervals and the repeat scan. The "
+        "These images show a phantom whose strain is known at every point, so the measurement can be compared with "
+        "the truth. For real images there is no such table; use the verdict, the intervals and the repeat scan. The "
         "phantom deforms by a prescribed motion, without forces, so no material set is the true one."
     )
     return [Section("Error against the truth", None, (table,), (), (text,))]
 
 
 def _made(outcomes: Mapping[str, StageOutcome], load: str) -> str:
-    """When a load was registered; empty where it has no result."""
+    """Time of the registration of a load; empty if it has no result."""
     outcome = outcomes.get(f"register {load}")
     return "" if outcome is None or outcome.record is None else outcome.record.made_utc

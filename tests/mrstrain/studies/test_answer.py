@@ -40,7 +40,7 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
     (first,) = answer_of([section("Load1"), section("Load2"), Section("Load3")], [overview], folder)
     table, area = first.tables
     assert (first.title, area.title) == ("Models and loads", "Area")
-    assert table.columns == ("load", "tissue", "median", "95th percentile", "nearest model")
+    assert table.columns == ("load", "tissue", "median", "95th percentile", "best match")
     assert table.rows == (
         ("Load1", "bone", "0", "0", "–"),
         ("Load1", "fat", "0.131 (0.103 to 0.139)", "0.425", "near"),
@@ -52,7 +52,7 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
 def test_registrations_alone_and_a_comparison_alone_are_shown_too(folder: Path, tmp_path: Path) -> None:
     (first,) = answer_of([section("Load1")], [], folder)
     assert first.tables[0].columns == ("load", "tissue", "median", "95th percentile")
-    assert "Nearest model" not in first.tables[0].note
+    assert "Best match" not in first.tables[0].note
     overview = Section("Models and loads")
     assert answer_of([Section("Load1")], [overview], folder) == [overview]
     assert answer_of([], [], folder) == []

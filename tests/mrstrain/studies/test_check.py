@@ -74,7 +74,7 @@ def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study
     values = np.full(GRID.shape, 9)
     values[:8], values[:4] = 1, 2
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
-    assert wrong(study).startswith("The set mine has no material law for the region 'skin'")
+    assert wrong(study).startswith("The material set mine has no material for the region 'skin'")
     assert wrong(study, ('"mine.toml", ', "")) == ""
 
 
@@ -82,23 +82,24 @@ def test_the_command_ends_with_status_2_where_something_is_wrong_and_0_where_not
     text = (study / "study.toml").read_text().replace('"mine.toml", ', "")
     (study / "study.toml").write_text(text)
     well = CliRunner().invoke(app, ["check", str(study)])
-    assert (well.exit_code, "WRONG" in well.output) == (0, False), well.output
+    assert (well.exit_code, "ERROR" in well.output) == (0, False), well.output
     (study / "Load1.nii.gz").unlink()
     ill = CliRunner().invoke(app, ["check", str(study)])
     assert ill.exit_code == 2
-    assert "WRONG" in ill.output
+    assert "ERROR" in ill.output
 
 
 def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
     def told() -> list[str]:
-        return [note for note in check(study).notes if note.startswith("CARE: talus")]
+        return [note for note in check(study).notes if note.startswith("WARNING: talus")]
 
     assert told() == []
     values = np.ones(GRID.shape, dtype=np.int64)
     values[:4], values[4:6] = 2, 3
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 3: "talus"}))
     assert told() == [
-        "CARE: talus will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
+        "WARNING: talus will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] "
+        "bones."
     ]
     (study / "study.toml").write_text(STUDY.replace("[mesh]", '[mesh]\nbones = ["bone", "talus"]'))
     assert told() == []
@@ -110,7 +111,7 @@ def test_a_plate_without_friction_carries_no_shear(study):
         told = wrong(
             study, ("[registration]", "taped = false\n[registration]"), ("[mesh]", mesh), ('"mine.toml", ', "")
         )
-        assert told.startswith("Load1: a plate without friction carries no shear")
+        assert told.startswith("Load1: a plate without friction cannot apply shear")
         assert told.count("\n") == 0
 
 
@@ -126,13 +127,13 @@ def test_a_label_map_to_mesh_that_lies_elsewhere_and_one_image_for_two_loads_are
     values[:4] = 2
     write_labels(study / "far.nii.gz", LabelMap(far, values, {1: "fat", 2: "bone"}))
     there = ("[mesh]", '[mesh]\nlabels = "far.nii.gz"\nnames = "tissues.csv"')
-    assert "only 0% of what it labels lies in the unloaded image" in wrong(study, there)
+    assert "only 0% of the labelled tissue lies in the unloaded image" in wrong(study, there)
     twice = ("[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\n[plate]')
-    assert wrong(study, twice) == "Load2 is the image of Load1: every voxel is equal."
+    assert wrong(study, twice) == "Load2 is identical to the image of Load1 (all voxels are equal)."
     forceless = (twice[0], twice[1].replace("normal_n = 2.0\n", ""))
     wrong(study, forceless)
     place = "line 12: [loads.Load2] 'normal_n'"
-    assert f"Load2: no force ({place}), so measured and not simulated." in check(study).notes
+    assert f"Load2: measured but not simulated, because no force is given ({place})." in check(study).notes
 
 
 def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
@@ -140,10 +141,10 @@ def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
     file, friedman = ("[mesh]", '[mesh]\nfile = "dome.vtu"'), ('"mine.toml", ', "")
     write_tet_mesh(study / "dome.vtu", made, {})
     assert wrong(study, file, friedman) == ""
-    assert "mine has no material law for the region 'skin'" in wrong(study, file)
-    assert "no facets 'cut'" in wrong(study, file, friedman, ("sets", 'fixed = ["bone", "cut"]\nsets'))
+    assert "mine has no material for the region 'skin'" in wrong(study, file)
+    assert "no surface set 'cut'" in wrong(study, file, friedman, ("sets", 'fixed = ["bone", "cut"]\nsets'))
     assert wrong(study, file, friedman, ("sets", 'fixed = ["Bone"]\nsets')) == ""  # case does not count
-    assert "nothing to touch" in wrong(study, file, friedman, ("sets", 'fixed = ["skin"]\nsets'))
+    assert "All nodes of 'skin' are fixed" in wrong(study, file, friedman, ("sets", 'fixed = ["skin"]\nsets'))
     far = TetMesh(made.points_mm + 400.0, made.cells, made.regions, made.facets)
     write_tet_mesh(study / "dome.vtu", far, {})
     assert "dome.vtu does not lie in the image" in wrong(study, file, friedman)
@@ -154,7 +155,7 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
     write_labels(study / "tissues.nii.gz", tissues)
     align, measured = ("[registration]", '[registration]\nalign = "image"'), ('"mine.toml", "friedman"', "")
     assert wrong(study, measured).startswith("line 4: [images] 'bone': The label map has no region 'bone'")
-    assert "line 16: [mesh] 'bones': The label map has no 'bone'" in wrong(study, align)  # a comparison needs one
+    assert "line 16: [mesh] 'bones': The label map has no label 'bone'" in wrong(study, align)  # a comparison needs one
     assert "no region 'sacrum'" in wrong(study, align, measured, ("labels =", 'bone = "sacrum"\nlabels ='))
     assert wrong(study, align, measured) == ""
     (stage,) = plan(read_study(study))
@@ -227,20 +228,20 @@ def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, mo
 
     def care(gib: float, workers: int = 3) -> list[str]:
         monkeypatch.setattr(costs, "usable_memory_bytes", lambda: int(gib * 1024**3))
-        return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("CARE")]
+        return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("WARNING")]
 
     assert care(12.0) == []  # three of 3.9 GiB
-    assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with workers=2 (--workers 2)."]
+    assert care(8.0) == ["WARNING: this machine has 8.0 GiB of memory; run with workers=2 (--workers 2)."]
     assert care(8.0, workers=2) == []
-    assert "crop the images" in care(3.0)[0]
+    assert "Crop the images" in care(3.0)[0]
 
 
 def test_what_is_fixed_beside_the_bone_has_to_be_there_and_decides_what_is_done_anew(study):
     friedman = ('"mine.toml", ', "")
-    assert "beside the bone's surface the cut may be fixed" in wrong(
+    assert "only 'cut' can be fixed in addition to the bone" in wrong(
         study, friedman, ("sets", 'fixed = ["skin"]\nsets')
     )
-    assert "needs a tissue called skin" in wrong(study, friedman, ("sets", 'fixed = ["Cut"]\nsets'))
+    assert "if a tissue of the label map is named skin" in wrong(study, friedman, ("sets", 'fixed = ["Cut"]\nsets'))
 
     def held(fixed: str) -> object:
         wrong(study, friedman, ("sets", f"{fixed}sets"))
@@ -259,11 +260,11 @@ def test_a_run_refuses_before_it_begins_what_all_of_it_needs(study, monkeypatch)
         (("labels =", 'bone = "calcaneuz"\nlabels ='), "no region 'calcaneuz'"),
         (("[mesh]", "[mesh]\nedge_mm = 0.02"), "half a voxel"),
         (("[mesh]", '[mesh]\nfiner = { region = "skni", edge_mm = 1.0 }'), "no region 'skni'"),
-        (("sets =", 'fixed = ["skin"]\nsets ='), "the cut may be fixed"),
+        (("sets =", 'fixed = ["skin"]\nsets ='), "only 'cut' can be fixed"),
     ):
         assert told in wrong(study, change)
         for begin in (run, forecast):
-            with pytest.raises(InputError, match=f"(?s)cannot be run as it is.*Heel: .*{told}"):
+            with pytest.raises(InputError, match=f"(?s)cannot be run.*Heel: .*{told}"):
                 begin(study)
         if "bone =" not in change[1]:
             assert forecast(study, only=("register",))["register Load1"] == "run"
@@ -284,7 +285,7 @@ def test_stages_are_refused_by_what_they_need_and_not_by_what_others_do(study):
     values = np.full(GRID.shape, 9)
     values[:8], values[:4] = 1, 2
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
-    assert "mine has no material law for the region 'skin'" in refused("mesh", "simulate mine")
+    assert "mine has no material for the region 'skin'" in refused("mesh", "simulate mine")
     assert refused("mesh") == refused("register") == refused("mesh", "simulate friedman") == ""
     second = STUDY.replace(
         "[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\nshear_direction = [2.0, 0.0, 0.0]\n[plate]'
@@ -301,7 +302,7 @@ def test_stages_are_refused_by_what_they_need_and_not_by_what_others_do(study):
 def test_an_image_that_all_registrations_read_is_refused_where_it_is_damaged(study, name):
     file = study / f"{name}.nii.gz"
     file.write_bytes(file.read_bytes()[:-99])
-    with pytest.raises(InputError, match=f"(?s)cannot be run as it is.*{name}"):
+    with pytest.raises(InputError, match=f"(?s)cannot be run.*{name}"):
         forecast(study, only=("register",))
     if name == "Load0":
         assert forecast(study, only=("mesh",))["mesh"] == "run"
@@ -324,7 +325,7 @@ def test_a_damaged_loaded_image_is_left_to_its_stage(study):
     assert wrong_with(told, plan(told)) == ()
 
 
-@pytest.mark.parametrize(("given", "told"), [("[0.5, 0.2]", "must rise"), ("[20.0, 50.0]", "no percent")])
+@pytest.mark.parametrize(("given", "told"), [("[0.5, 0.2]", "must increase"), ("[20.0, 50.0]", "not in percent")])
 def test_a_range_of_strain_that_no_comparison_takes_is_refused_with_the_study_file(study, given, told):
     (study / "study.toml").write_text(STUDY + f"[compare]\nstrains = {given}\n")
     with pytest.raises(InputError, match=rf"\[compare\] 'strains': .*{told}"):
@@ -351,7 +352,7 @@ def test_gaps_are_left_out_where_the_study_says_so(study):
 
 
 def test_what_a_machine_has_too_little_of_is_said_before_a_run_and_logged(caplog):
-    lines, logged = ["To do: 1 of 1 stages", "CARE: this machine has 1.0 GiB of memory"], list[str]()
+    lines, logged = ["To do: 1 of 1 stages", "WARNING: this machine has 1.0 GiB of memory"], list[str]()
     _tell(lines, logged.append)
     assert logged == lines
     assert caplog.messages == lines[1:]

@@ -63,7 +63,7 @@ def test_another_phantom_in_the_folder_is_refused(folder):
 
 def test_a_study_of_ones_own_is_not_touched(tmp_path):
     (tmp_path / "study.toml").write_text("mine")
-    with pytest.raises(OutputError, match="would replace"):
+    with pytest.raises(OutputError, match="would overwrite"):
         _make(tmp_path, 1, False, None)
     assert (tmp_path / "study.toml").read_text() == "mine"
 
@@ -114,7 +114,7 @@ def test_a_load_that_a_model_does_not_carry_is_no_failure_of_the_demonstration()
 
     assert reached()
     assert not reached(retry=True)
-    assert not reached(reason="Made from other inputs than the study names now.")
+    assert not reached(reason="The inputs have changed since this result was made.")
     assert not reached(there=False)
 
 

@@ -33,11 +33,11 @@ def test_what_has_no_role_is_told_and_stands_in_the_study_file(tmp_path):
     assert (study.images.labels, study.images.bone) == (Path("labels.nii.gz"), Path("calcaneus.nii.gz"))
     assert study.loads["Load1"].image == "Load1.nii.gz"
     for name, why in (
-        ("tissues.nii.gz", "since labels.nii.gz is taken for the label map"),
-        ("other-bone.nii.gz", "since calcaneus.nii.gz is taken for the bone"),
-        ("Load1.nrrd", "since Load1.nii.gz is taken for the load of that name"),
-        ("Load1-again.nii.gz", "whose name tells no role"),
-        ("T1 <scout>.nii.gz", "whose name tells no role"),
+        ("tissues.nii.gz", "because labels.nii.gz is used as the label map"),
+        ("other-bone.nii.gz", "because calcaneus.nii.gz is used as the bone"),
+        ("Load1.nrrd", "because Load1.nii.gz is used as the load of that name"),
+        ("Load1-again.nii.gz", "because its name does not indicate a role"),
+        ("T1 <scout>.nii.gz", "because its name does not indicate a role"),
     ):
         assert f"NOT USED: {name}, {why}" in told
         assert f'# NOT USED: "{name.split("<", maxsplit=1)[0]}' in text
@@ -109,7 +109,7 @@ def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
     begun = init(tmp_path)
     assert begun.inputs.load0 == "Load0"
     assert begun.inputs.loads == {"Load1": "Load1", "Load2": "Load2"}
-    assert "NOT USED: Load3, a folder without a DICOM image in it" in begun.summary()
+    assert "NOT USED: Load3, because the folder contains no DICOM image" in begun.summary()
     assert any(": labels = " in line for line in begun.summary())
     (tmp_path / "study.toml").unlink()
     (tmp_path / "tissues.nii.gz").touch()

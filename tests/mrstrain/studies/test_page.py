@@ -84,10 +84,10 @@ def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(stu
     sound = {"register_Load1": SOUND, "register_Load2": SOUND}
     only = ended(study, **sound)
     told = head(page_of(study, only))
-    assert told.startswith("Heel Trust The measurement: 2 images are registered soundly. Not asked for")
+    assert told.startswith("Heel Trust All 2 registrations can be trusted. Not requested")
     assert told.endswith("without a result: mesh, simulate trebbi, compare.")
     assert StudyRun(study, only).complete
-    assert "Not asked for, and without a result: mesh, simulate trebbi, compare." in StudyRun(study, only).summary()
+    assert "Not requested, and without a result: mesh, simulate trebbi, compare." in StudyRun(study, only).summary()
 
     broken = ended(study, **sound, mesh="It broke.\nTraceback", simulate_trebbi="Not run: mesh has no result.")
     told = head(page_of(study, broken))
@@ -163,7 +163,7 @@ def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_
     page = (study.out / "report.html").read_text()
     assert "0.0123" in page
     assert "0.0456" not in page
-    assert "Registered again since, so not known: Load2" in page
+    assert "Unknown for Load2, registered again since" in page
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_only_what_was_asked_for_decides_the_exit(study: Study) -> None:
         ledger.keep(stage, ledger.key(stage, made_from, {}), made_from, SOUND, 1.0)
     told = CliRunner().invoke(app, ["run", str(study.place), "--only", "register"])
     assert told.exit_code == 0, told.output
-    assert "Not asked for, and without a result: mesh, simulate trebbi, compare." in told.output
+    assert "Not requested, and without a result: mesh, simulate trebbi, compare." in told.output
     assert run(study, only=["register"]).complete
     with pytest.raises(MrstrainError):
         run(study, only=["registr"])

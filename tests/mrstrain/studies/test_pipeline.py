@@ -105,7 +105,7 @@ def test_finished_work_is_not_done_again(folder):
     assert "    compare done" in told
     again, outcomes, _ = ran(folder)
     assert again == []
-    assert all(o.status == "there already" for o in outcomes.values())
+    assert all(o.status == "up to date" for o in outcomes.values())
 
 
 def test_the_stage_with_the_longest_row_behind_it_is_started_first(folder):
@@ -175,9 +175,9 @@ def test_only_and_force(folder):
     (folder / "a.txt").write_text("z")
     first, outcomes, _ = ran(folder, only=("mesh", "simulate", "compare"))
     assert first == []
-    assert outcomes["register a"].reason.startswith("Made from other inputs")
+    assert outcomes["register a"].reason.startswith("The inputs have changed")
     assert outcomes["compare"].status == "OUT OF DATE"  # what builds on it is no newer
-    assert outcomes["compare"].reason == "Built on register a, out of date."
+    assert outcomes["compare"].reason == "It depends on results that are out of date: register a."
     assert [name for name, one in outcomes.items() if not one.requested] == ["register a", "register b"]
     assert [name for name, one in outcomes.items() if not one.complete] == ["register a", "compare"]
     first, outcomes, _ = ran(folder, only=("compare",), force=("compare",))
@@ -189,9 +189,9 @@ def test_only_and_force(folder):
 @pytest.mark.parametrize(
     ("only", "force", "says"),
     [
-        (("registr",), (), "No stage is called 'registr'. There are: register a"),
-        (("register",), ("mesh",), r"force \(mesh\) makes nothing anew: only \(register\) leaves it out"),
-        (("register a",), ("register b",), r"force \(register b\) makes nothing"),
+        (("registr",), (), "There is no stage 'registr'. The stages are: register a"),
+        (("register",), ("mesh",), r"force \(mesh\) has no effect, because only \(register\) excludes this stage"),
+        (("register a",), ("register b",), r"force \(register b\) has no effect"),
     ],
 )
 def test_what_no_stage_answers_to_is_refused(folder, only, force, says):
@@ -223,11 +223,17 @@ HERE, NUMPY = software_key("mrstrain"), f"numpy {distribution_versions()['numpy'
 @pytest.mark.parametrize(
     ("workers", "says"),
     [
-        (Workers(None), "have no mrstrain"),
-        (Workers(("0.1.0, code abc", False, True)), "has 0.1.0, code abc; here is mrstrain "),  # as earlier ones answer
-        (Workers((HERE.replace(NUMPY, "numpy 1.0"), False, True)), f"has numpy 1.0; here is {NUMPY}: start"),
-        (Workers((HERE, False, False)), "does not see"),
-        (Workers((HERE, False, True), threads=4), "runs 4 stages at once"),
+        (Workers(None), "mrstrain is not installed"),
+        (
+            Workers(("0.1.0, code abc", False, True)),
+            "has 0.1.0, code abc, but this machine has mrstrain ",
+        ),  # as earlier ones answer
+        (
+            Workers((HERE.replace(NUMPY, "numpy 1.0"), False, True)),
+            f"has numpy 1.0, but this machine has {NUMPY}. Start",
+        ),
+        (Workers((HERE, False, False)), "has no access to"),
+        (Workers((HERE, False, True), threads=4), "runs 4 stages at the same time"),
         (Workers((HERE, True, True)), "may not start processes"),
     ],
 )
