@@ -29,13 +29,13 @@ def pages() -> Iterator[tuple[str, str]]:
 
 
 def strings() -> Iterator[tuple[str, str]]:
-    """Every string of the code, docstrings and messages alike, and the templates of pages."""
+    """Every string of the code, docstrings and messages alike, and the templates of pages and files."""
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
                     yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
-        for path in sorted((ROOT / package).rglob("*.html")):
+        for path in sorted(p for ending in ("j2", "toml") for p in (ROOT / package).rglob(f"*.{ending}")):
             yield str(path.relative_to(ROOT)), path.read_text()
 
 
