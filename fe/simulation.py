@@ -168,6 +168,17 @@ class Simulation:
         """Cauchy stress of each cell (m, 3, 3) under a load, MPa, LPS."""
         return result.cauchy_stress(self.state(load), self.mesh, self.materials.materials)
 
+    @property
+    def headline(self) -> str:
+        """The plate's displacement under each load, in a line."""
+        plates = []
+        for state in self.states:
+            moved, along, _ = state.plate_displacement_mm
+            sheared = f" and {along:z.1f} along" if state.load.sheared else ""
+            part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%} of the load)"
+            plates.append(f"{state.load.name} {moved:z.1f}{sheared}{part}")
+        return f"plate displacement, mm: {', '.join(plates)}"
+
     def __str__(self) -> str:
         lines = []
         for state in self.states:

@@ -103,12 +103,13 @@ class Comparison:
         title = f"Area between strain-volume curves, maximum shear strain {low:g} to {high:g}, mL{interval}"
         picture = Picture("Strain-volume curves", "", png_bytes(self.plot()))
         words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}.", *self.verdict.reasons]
-        return notebook_html(self._answer(), picture, Table(title, head, rows), notes=words)
+        return notebook_html(self.headline, picture, Table(title, head, rows), notes=words)
 
-    def _answer(self) -> str:
+    @property
+    def headline(self) -> str:
         """One sentence: the best match, or the area of a single model."""
-        if self.ranking.statements:
-            return self.ranking.statements[0]
+        if best_match := next((line for line in self.ranking.statements if line.startswith("Best match")), None):
+            return best_match
         ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
         best = min(ranked, key=lambda a: a.best_ml)
         nothing = {a.load: a for a in (*self.areas, self.ranking.nothing) if (a.model, a.tissue) == (NOTHING, ALL)}

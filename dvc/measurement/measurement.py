@@ -224,6 +224,16 @@ class Measurement:
         shear = ", ".join(f"{r.region} {r.median:z.3f} / {r.p95:z.3f}" for r in rows)
         return f"maximum shear strain (E1 - E3)/2, median / 95th percentile: {shear}"
 
+    @property
+    def headline(self) -> str:
+        """The maximum shear strain of the region with most of it (median times volume), and the verdict, in a line."""
+        rows = [r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median)]
+        if not rows:
+            return f"no maximum shear strain; {self.verdict.words}"
+        most = max(rows, key=lambda r: r.median * r.volume_ml)
+        strain = f"{most.median:z.3f} median, {most.p95:z.3f} at the 95th percentile"
+        return f"max. shear strain in {most.region} {strain}; {self.verdict.words}"
+
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, in lines."""
         return [

@@ -19,6 +19,8 @@ from dvc.trust.error_model import Interval
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
 
+STRAIN = "Maximum shear strain"
+"""Title of the picture of the strain."""
 SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
 """Upper ends of the colours for maximum shear strain and its standard deviation."""
 _TWIN = (
@@ -48,7 +50,7 @@ def pictures_of(
         drawn["similarity"] = Picture.drawn("Local similarity of the images", figures.similarity_slices, *local)
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
     through = "Slices through the lowest point of the bone along the plate normal."
-    picture = Picture.drawn("Maximum shear strain", figures.strain_slices, *strain, note=through)
+    picture = Picture.drawn(STRAIN, figures.strain_slices, *strain, note=through)
     if images is not None:
         both = {"unloaded": reference, "loaded, registered": Image(reference.grid, images.registered)}
         beneath = tuple((name, figures.image_slices(view, image)) for name, image in both.items())

@@ -5,7 +5,7 @@ import gzip
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Self
@@ -193,6 +193,7 @@ def _packed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, mtime=0)).decode()
 
 
+@lru_cache(maxsize=64)
 def _small(png: bytes) -> str:
     with Pixels.open(io.BytesIO(png)) as picture:
         file, pixels = io.BytesIO(), picture.convert("RGB")
@@ -219,12 +220,13 @@ def write_report(
     provenance: Mapping[str, str],
     *,
     notes: Sequence[str] = (),
+    reload_s: int | None = None,
 ) -> None:
     """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
     One HTML file without anything to fetch; all text is escaped. With two sections or more a list of them, with their
     verdicts, stands beside them. ``notes``, a line each, stand below the verdict. Closing sections and provenance are
-    folded. OutputError if the file cannot be written.
+    folded. A browser loads a page anew every ``reload_s`` seconds. OutputError if the file cannot be written.
     """
     told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance, "closing": closing}
     volumes: dict[str, str] = {}  # each once, however many viewers show it
@@ -233,7 +235,9 @@ def write_report(
             volumes.setdefault(volume.data, f"volume-{len(volumes) + 1}")
     scripts = {"page": _stored("page.js"), "viewer": _stored("viewer.js")}
     library = {"version": NIIVUE, "licence": _stored("niivue-LICENSE.txt"), "packed": _library()} if volumes else None
-    page = _template("report").render(**told, sections=sections, volumes=volumes, scripts=scripts, library=library)
+    page = _template("report").render(
+        **told, sections=sections, volumes=volumes, scripts=scripts, library=library, reload_s=reload_s
+    )
     write_whole(path, page)
 
 

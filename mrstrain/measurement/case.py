@@ -19,11 +19,12 @@ class Case:
     folder: Path
     section: Section
     lines: tuple[str, ...]
+    headline: str
 
     @classmethod
     def of(cls, measurement: Measurement, folder: Path, record: Mapping[str, object]) -> Self:
         """Write a measurement, with its provenance; its folder is there whole or not at all."""
-        return cls(folder, measurement.write(folder, record), tuple(measurement.summary()))
+        return cls(folder, measurement.write(folder, record), tuple(measurement.summary()), measurement.headline)
 
     @property
     def name(self) -> str:

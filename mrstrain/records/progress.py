@@ -7,16 +7,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 OnProgress = Callable[[str, str, float], None]
-"""``progress(case, stage, fraction)``: what is being done for which case, and how far it is (0 to 1)."""
+"""``progress(case, stage, fraction)``: what is being done for which case, and how far it is (0 to 1).
+
+A stage of a study is a case; when it has ended (1), what it found stands in the place of what is being done.
+"""
 
 ALL = "all"
-"""The case that stands for a whole study, or several."""
+"""The case that stands for a whole study, or several; its fraction is the share of the time, spent and to come."""
 
 _LINE_EVERY_S = 15.0
-_LINE_OF_ALL_EVERY_S, _BETWEEN_ENDS_S = 60.0, 1.0
+_LINE_OF_ALL_EVERY_S = 60.0
+_LEAST_SHARE = 0.02
 
 
 @contextmanager
@@ -24,7 +29,8 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
     """Show progress on standard error; standard output is for results. An interrupt is reported in a line.
 
     ``of_all`` says that the case "all" is reported besides its parts, as studies do. Its bar is then the first and
-    shown from the start; without a terminal its line is the only one, because the study's log has those of the cases.
+    shown from the start, and what a part found is printed when it has ended. Without a terminal there is a line for
+    each part that has ended, and one every minute between.
     """
     console = console or Console(stderr=True)
     try:
@@ -38,12 +44,35 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
         raise
 
 
+def duration(seconds: float) -> str:
+    """A time as people say it.
+
+    >>> [duration(s) for s in (0.4, 89.0, 100.0, 5000.0, 9000.0)]
+    ['0 s', '89 s', '2 min', '83 min', '2.5 h']
+    """
+    minutes = seconds / 60.0
+    return f"{seconds:.0f} s" if minutes < 1.5 else f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
+
+
+def _left(spent_s: float, fraction: float) -> str:
+    """The time left, if it can be told yet."""
+    known = _LEAST_SHARE <= fraction < 1.0
+    return f"about {duration(spent_s * (1.0 - fraction) / fraction)} left" if known else ""
+
+
+class _TimeLeft(ProgressColumn):
+    """The time left of a bar, from its share and the time that it took."""
+
+    def render(self, task: Task) -> Text:
+        return Text(_left(task.elapsed or 0.0, task.completed))
+
+
 @contextmanager
 def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
     """Show a bar for each case under way; finished ones are hidden, because lines beyond the terminal are cut off."""
     bars: dict[str, TaskID] = {}
-    name, percentage, left = (TextColumn(text) for text in ("{task.description}", "{task.percentage:>3.0f} %", "left"))
-    columns = name, BarColumn(), percentage, TimeElapsedColumn(), left, TimeRemainingColumn()
+    name, percentage = (TextColumn(text) for text in ("{task.description}", "{task.percentage:>3.0f} %"))
+    columns = name, BarColumn(), percentage, TimeElapsedColumn(), _TimeLeft()
     with Progress(*columns, console=console) as display:
         stages: dict[str, str] = {}
         if of_all:
@@ -55,8 +84,12 @@ def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
                 bars[case] = display.add_task(case, total=1.0, visible=visible)
             if stages.get(case) != stage:
                 stages[case] = stage
-                display.reset(bars[case], total=1.0, description=f"{case}: {stage}")
+                if not of_all:  # parts of a case that is no stage of a study begin at 0 each
+                    display.reset(bars[case], total=1.0)
+                display.update(bars[case], description=f"{case}: {stage}")
             display.update(bars[case], completed=fraction, visible=visible)
+            if of_all and not visible:
+                console.print(f"{case}: {stage}", markup=False, highlight=False)
 
         yield progress
 
@@ -78,20 +111,21 @@ def _lines() -> OnProgress:
 
 
 def _lines_of_all() -> OnProgress:
-    """Print a line of the whole study when a stage ends, and every minute between."""
+    """Print a line for each part that has ended, with how far all are, and a line of all every minute between."""
     began = printed_at = time.monotonic()
-    last_stage, last_fraction = "begun", 0.0
+    found = list[str]()
 
     def progress(case: str, stage: str, fraction: float) -> None:
-        nonlocal printed_at, last_stage, last_fraction
+        nonlocal printed_at
         now = time.monotonic()
-        stage_ended = case == ALL and last_fraction < 1.0
-        if stage_ended:
-            last_stage, last_fraction = stage, fraction
-        all_ended = stage_ended and fraction >= 1.0
-        if all_ended or now - printed_at >= (_BETWEEN_ENDS_S if stage_ended else _LINE_OF_ALL_EVERY_S):
+        if case != ALL:
+            found.extend([f"{case}: {stage}"] if fraction >= 1.0 else [])
+        elif found or fraction >= 1.0 or now - printed_at >= _LINE_OF_ALL_EVERY_S:
             printed_at = now
-            _print(ALL, last_stage, last_fraction, now - began)
+            left = f", {time_left}" if (time_left := _left(now - began, fraction)) else ""
+            for line in found or ["all"]:
+                print(f"{line} ({stage} after {duration(now - began)}{left})", file=sys.stderr, flush=True)
+            found.clear()
 
     return progress
 

@@ -19,6 +19,7 @@ from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
 from mrstrain.studies.plan import COMPARISON
 from mrstrain.studies.run import StudyRun, run_studies
+from mrstrain.studies.watch import Follower
 from validate import ALL, LEVELLED, NOTHING, CohortRank, over_subjects, rank_over_subjects
 
 _TOTAL = "all loads"
@@ -86,7 +87,7 @@ def cohort(
     if len(ranges) > 1:
         raise InputError(f"The studies have different ranges of strain ([compare] strains): {sorted(ranges)}.")
     refuse_other_laws(read)
-    ran = run_studies(read, scheduler=scheduler, workers=workers, progress=progress)
+    ran = run_studies(read, scheduler=scheduler, workers=workers, follower=Follower(progress))
     by_name = dict(zip(names, ran, strict=True))
     without = {name: why for name, one in by_name.items() if (why := _uncounted(one))}
     areas = {name: _areas(one.study.out) for name, one in by_name.items() if name not in without}

@@ -8,11 +8,13 @@ import numpy as np
 from dvc import TetMesh, read_image, read_labels
 from dvc.errors import InputError
 from dvc.registration.engine import Cost
+from dvc.threads import usable_cores
 from fe import LoadStep, material_set, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.studies.file import Study
 from mrstrain.studies.plan import Stage, labels_to_mesh, mesh_place
+from mrstrain.studies.time_left import Expected, TimeLeft
 
 CARE = "WARNING"
 """Begins a line on too little memory or disk space."""
@@ -20,14 +22,14 @@ CARE = "WARNING"
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
 _REGISTER_S, _MAPS_S_PER_MVOXEL = 13.0, 3.5  # in addition to the engine (`Cost`)
 _TWIN = 1.3  # additional time, relative: the synthetic warp is made and registered
-_CELLS, _LOAD_S, _GROWTH = 66e3, 35.0, 1.5
+_CELLS, _LOAD_S, _GROWTH = 66e3, 22.0, 1.5
 # The seven published sets took .5 to 2.6 times as long as this says, whose softest tissues have .3 to 390 kPa.
 _SOFT_MPA, _SOFTER = 0.01, 0.4
 # Of P1's time and memory: P2 20 times as long on 60,000 cells of the heel, MINI a third of P2's time on 56,000, where
 # P2 took 2.2 GiB, MINI .84.
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
-_MESH_S = 40.0
+_MESH_S = 25.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
 # with strain discontinuities 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells
@@ -103,16 +105,13 @@ def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
     return images + 1e6 * _MB_MODEL * models
 
 
-def seconds_to_end(left: Sequence[Stage], seconds: Sequence[float]) -> dict[str, float]:
-    """Seconds from the start of each stage to the end of the longest chain of stages that wait for one another.
-
-    More cores do not shorten it. A study ends soonest if the stage with the longest chain is started first.
-    """
-    to_end: dict[str, float] = {}
-    for stage, own in reversed(list(zip(left, seconds, strict=True))):
-        waiting = (to_end[other.name] for other in left if stage.name in other.before)
-        to_end[stage.name] = own + max(waiting, default=0.0)
-    return to_end
+def expected(left: Sequence[Stage], study: Study, voxels: float, cells: float) -> dict[str, Expected]:
+    """Expected time of each stage, by name; other parameters as in `seconds_of`."""
+    told: dict[str, Expected] = {}
+    for stage in left:
+        cores = usable_cores() if stage.kind == "compare" else 1
+        told[stage.name] = Expected(seconds_of(stage, study, voxels, cells) / cores, cores, stage.before)
+    return told
 
 
 def mesh_given(study: Study) -> TetMesh:
@@ -131,8 +130,7 @@ def costs(
 
     ``workers`` is the number of stages at the same time; the other parameters are as in `seconds_of`.
     """
-    seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
-    minutes = max(sum(seconds) / workers, *seconds_to_end(left, seconds).values()) / 60.0
+    minutes = TimeLeft(expected(left, study, voxels, cells), workers).seconds() / 60.0
     gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
     needed = sum(gib[:workers])  # the largest stages may run at the same time
     disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9

@@ -1,6 +1,9 @@
 """`demo`: a complete study of a heel phantom with known strain, with the measurement error by tissue."""
 
 import json
+import time
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from dvc import read_labels, write_labels
@@ -9,13 +12,13 @@ from dvc.errors import OutputError
 from dvc.io.result_folder import REPORT, read_maps
 from mrstrain.models.simulate import LOADS
 from mrstrain.records.outcome import Outcome
-from mrstrain.records.progress import OnProgress
-from mrstrain.studies.file import FILE
-from mrstrain.studies.page import write_run_report
+from mrstrain.records.progress import ALL, OnProgress
+from mrstrain.studies.file import FILE, Study, read_study
 from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import REGISTRATION
-from mrstrain.studies.run import StudyRun, run
+from mrstrain.studies.run import StudyRun, run_studies
 from mrstrain.studies.true_error import TABLE, read_errors, write_errors
+from mrstrain.studies.watch import Follower, OnReport
 from mrstrain.truth.phantom import TRUTH, phantom
 from phantoms import Heel, TissueError, errors_of_maps, heel_grid, labels_of, labels_to_mesh
 
@@ -23,6 +26,7 @@ _SETS = ("trebbi", "luboz", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
 _COARSE = "tissues_to_mesh_coarse"
 _COARSE_MM = 1.2  # voxels of the label map that is meshed
+_PHANTOM_SHARE = {False: 0.2, True: 0.01}  # of the total time, for the coarse mesh (False) and the published size (True)
 _STUDY = """# Demonstration: a heel phantom whose strain is known at every point (see the folder truth).
 [study]
 name = "Phantom heel"
@@ -54,7 +58,7 @@ shear_n = {shear_n}
 
 def demo(
     out: Path | str, *, seed: int = 1, full: bool = False, workers: int | None = None,
-    progress: OnProgress | None = None,
+    progress: OnProgress | None = None, on_report: OnReport | None = None,
 ) -> Outcome:  # fmt: skip
     """Make a heel phantom under four loads, run its study, and compare the measurement with the truth.
 
@@ -62,18 +66,28 @@ def demo(
         run in the same folder resumes.
     seed: Seed of the phantom.
     full: All seven published material sets on about 75,000 tetrahedra; otherwise three sets on a coarser mesh.
-    workers, progress: As in `mrstrain.run`.
+    workers, progress, on_report: As in `mrstrain.run`.
     Returns the summary. It is complete unless a stage failed; a load that a model does not reach is not a failure.
     Raises OutputError if the folder contains another phantom, or other files that would be overwritten.
     """
-    target = Path(out)
-    _make(target, seed, full, progress)
-    done = run(target, workers=workers, progress=progress)
-    errors = _errors(target, done, read_errors(target / TABLE, done.outcomes))
-    write_errors(target / TABLE, errors, done.outcomes)
-    write_run_report(target / "results" / REPORT, done.study, done.outcomes)
+    target, began = Path(out), time.monotonic()
+    _make(target, seed, full, None if progress is None else partial(_making, progress, _PHANTOM_SHARE[full]))
+    errors: dict[str, tuple[TissueError, ...]] = {}
+
+    def compare(study: Study, outcomes: Mapping[str, StageOutcome]) -> None:
+        errors.update(_errors(study, outcomes, read_errors(target / TABLE, outcomes)))
+        write_errors(target / TABLE, errors, outcomes)
+
+    follower = Follower(progress, on_report, compare, began)
+    (done,) = run_studies([read_study(target)], workers=workers, follower=follower)
     complete = all(_reached(outcome) for outcome in done.outcomes.values())
     return Outcome(done.study.out, tuple(_summary(errors, done)), complete)
+
+
+def _making(progress: OnProgress, share: float, case: str, stage: str, fraction: float) -> None:
+    """Report how far the phantom is, and all, of which it takes a share of the time."""
+    progress(case, stage, fraction)
+    progress(ALL, "making the phantom", share * fraction)
 
 
 def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> None:
@@ -113,17 +127,17 @@ def _text(seed: int, full: bool) -> str:
 
 
 def _errors(
-    target: Path, done: StudyRun, known: dict[str, tuple[TissueError, ...]]
+    study: Study, outcomes: Mapping[str, StageOutcome], known: Mapping[str, tuple[TissueError, ...]]
 ) -> dict[str, tuple[TissueError, ...]]:
     """Error of each load by tissue, where its strain is valid; ``known`` errors are not computed again."""
-    labels = read_labels(target / "tissues.nii.gz", target / "tissues.csv")
+    labels = read_labels(study.path("tissues.nii.gz"), study.path("tissues.csv"))
     errors = {}
-    for load in done.study.loads:
+    for load in study.loads:
         if load in known:
             errors[load] = known[load]
-        elif done.outcomes[f"register {load}"].record is not None:
-            measured = read_maps(done.study.out / REGISTRATION / load)
-            errors[load] = errors_of_maps(labels, read_maps(target / TRUTH / load), measured)
+        elif outcomes[f"register {load}"].record is not None:
+            measured = read_maps(study.out / REGISTRATION / load)
+            errors[load] = errors_of_maps(labels, read_maps(study.place / TRUTH / load), measured)
     return errors
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from dvc import Verdict
 from dvc.atomic_files import write_json
 from dvc.io.result_folder import PROVENANCE
-from dvc.report.page import METHODS, Section, Table, record_lines, write_report
+from dvc.measurement.page import STRAIN
+from dvc.report.page import METHODS, Picture, Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.records.provenance import provenance, without_folders
@@ -16,6 +17,8 @@ from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome, left_out_of
 from mrstrain.studies.plan import COMPARISON, REGISTRATION
 from mrstrain.studies.true_error import error_against_truth
+
+_RELOAD_S = 10  # a browser shows the page anew, while a study runs
 
 
 def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutcome]) -> None:
@@ -42,6 +45,36 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     sections = [*answer, *(replace(section, folded=True) for section in others)]
     verdict = _verdict([one for of in of_loads.values() for one in of.verdicts], compared)
     write_report(path, study.study.name, verdict, sections, closing, record_lines(record), notes=_incomplete(outcomes))
+
+
+def write_page_in_progress(
+    path: Path, study: Study, stages: Sequence[str], outcomes: Mapping[str, StageOutcome],
+    under_way: Sequence[str], told: str, *, ended: bool,
+) -> None:  # fmt: skip
+    """Write what stands at the report's place while a study runs: each stage, and the loads measured so far.
+
+    A browser loads it anew every few seconds, unless the run has ``ended``. It has one picture for each load, so that
+    it costs next to nothing.
+    """
+    rows = [
+        (name, outcomes[name].status, outcomes[name].headline) if name in outcomes
+        else (name, "under way" if name in under_way else "waiting", "")
+        for name in stages
+    ]  # fmt: skip
+    measured = (outcomes[name] for load in study.loads if (name := f"register {load}") in outcomes)
+    of_loads = [section for one in measured for section in one.result.sections]
+    pictures = tuple(picture for section in of_loads for picture in _strain(section))
+    sections = [
+        *(replace(one, pictures=pictures, pictures_first=True) for one in answer_of(of_loads, (), study.out)),
+        Section("Progress", None, (Table("Stages", ("stage", "state", "what it found"), tuple(rows)),)),
+    ]
+    write_report(path, study.study.name, None, sections, (), {}, notes=[told], reload_s=None if ended else _RELOAD_S)
+
+
+def _strain(section: Section) -> list[Picture]:
+    """The picture of a load's strain, called as the load, with the verdict, and without those beneath it."""
+    title = section.title if section.verdict is None else f"{section.title}: {section.verdict.words}"
+    return [replace(one, title=title, beneath=()) for one in section.pictures if one.title == STRAIN]
 
 
 def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdict | None:

@@ -36,6 +36,14 @@ class StageOutcome:
         return StageResult(()) if self.record is None else self.record.result
 
     @property
+    def headline(self) -> str:
+        """What was found, or why there is no result, in a line."""
+        if self.complete:
+            return self.result.headline or self.status
+        why = self.reason.partition("\n")[0] or self.result.headline
+        return f"{self.status}. {why}" if why else self.status
+
+    @property
     def left_out(self) -> bool:
         """Whether it has no result only because it was not requested."""
         return not self.requested and self.status == "not run"
@@ -197,12 +205,26 @@ class Pipeline:
         return StageOutcome(stage.name, record, self._outdated_inputs(stage))
 
 
-def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Mapping[str, Log]) -> None:
+def run_all(
+    pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Mapping[str, Log],
+    ended: Callable[[str, StageOutcome], None] = lambda _name, _outcome: None,
+) -> None:  # fmt: skip
     """Run the remaining stages of several studies on one cluster.
 
     Keys of pipelines and logs are prefixes that distinguish the stage names of different studies. A log gets a line for
-    each stage that ends. ``pool`` returns a context with a `StageRunner`, and is called only if there is work.
+    each stage that ends, and ``ended`` gets its name and outcome once the stages that waited for it have been started.
+    ``pool`` returns a context with a `StageRunner`, and is called only if there is work.
     """
+    told: set[str] = set()
+
+    def begin(prefix: str) -> None:
+        pipeline = pipelines[prefix]
+        pipeline.start(runner, logs[prefix], prefix)
+        for name, outcome in pipeline.outcomes.items():
+            if prefix + name not in told:
+                told.add(prefix + name)
+                ended(prefix + name, outcome)
+
     prefixes = {prefix + stage.name: prefix for prefix, pipeline in pipelines.items() for stage in pipeline.stages}
     with ExitStack() as stack:
         runners: list[StageRunner] = []
@@ -212,13 +234,13 @@ def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Ma
                 runners.append(stack.enter_context(pool()))
             return runners[0]
 
-        for prefix, pipeline in pipelines.items():
-            pipeline.start(runner, logs[prefix], prefix)
+        for prefix in pipelines:
+            begin(prefix)
         while runners and runners[0].busy:
             name, result, seconds = runners[0].next()
             prefix = prefixes[name]
             pipelines[prefix].end(name.removeprefix(prefix), result, seconds, logs[prefix])
-            pipelines[prefix].start(runner, logs[prefix], prefix)
+            begin(prefix)
 
 
 def _missing(stage: Stage, available: Collection[str]) -> str:

@@ -4,7 +4,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -18,12 +18,14 @@ from dvc.threads import usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
-from mrstrain.studies.costs import CARE, costs, disk_bytes, seconds_of, seconds_to_end, sizes_of
+from mrstrain.studies.costs import CARE, costs, disk_bytes, expected, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
 from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, left_out_of, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
+from mrstrain.studies.time_left import Expected, TimeLeft, seconds_to_end
+from mrstrain.studies.watch import Follower, OnReport, Report, Watch
 
 LOG = "study.log"
 _warnings = logging.getLogger("mrstrain.studies")
@@ -72,7 +74,7 @@ class StudyRun:
 
 def run(
     study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = (), scheduler: str | None = None,
-    workers: int | None = None, progress: OnProgress | None = None,
+    workers: int | None = None, progress: OnProgress | None = None, on_report: OnReport | None = None,
 ) -> StudyRun:  # fmt: skip
     """Run a study: register, mesh, simulate, compare and report.
 
@@ -91,6 +93,9 @@ def run(
         Number of stages at the same time on this machine; by default one for each core.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
+    on_report : callable, optional
+        ``on_report(path)`` is called once, as soon as the report shows a picture that this run has made. The report is
+        there from the start, and grows until the run ends.
 
     Returns
     -------
@@ -108,13 +113,14 @@ def run(
         If another run uses the same folder, or it cannot be written to.
     """
     return run_studies(
-        [read_study(study)], only=only, force=force, scheduler=scheduler, workers=workers, progress=progress
-    )[0]
+        [read_study(study)], only=only, force=force, scheduler=scheduler, workers=workers,
+        follower=Follower(progress, on_report),
+    )[0]  # fmt: skip
 
 
 def run_studies(
     studies: Sequence[Study], *, only: Sequence[str] = (), force: Sequence[str] = (), scheduler: str | None = None,
-    workers: int | None = None, progress: OnProgress | None = None,
+    workers: int | None = None, follower: Follower | None = None,
 ) -> list[StudyRun]:  # fmt: skip
     """Run studies of different names on one cluster, each as in `run`; errors are raised before any of them is run."""
     if scheduler is not None and workers is not None:
@@ -124,20 +130,22 @@ def run_studies(
         )
     named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
     pipelines, to_do = _planned(named, only, force)
-    of_all = f"{sum(len(pipeline.stages) for pipeline in pipelines.values())} stages"
-    total = _TotalProgress(progress or (lambda *_: None), of_all)
+    at_once, follower = workers or usable_cores(), follower or Follower()
+    reports = {prefix: Report(study, pipelines[prefix], follower.on_report) for prefix, study in named.items()}
+    expectations: dict[str, Expected] = {}
+    watch = Watch(follower, reports, TimeLeft(expectations, at_once))
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
 
-        return cluster(total.report, [study.out for study in studies], scheduler=scheduler, workers=workers)
+        return cluster(watch.told, [study.out for study in studies], scheduler=scheduler, workers=workers)
 
     logs: dict[str, Log] = {}
     needed: dict[int, list[float]] = defaultdict(list)  # bytes of the stages that write to each disk
     with ExitStack() as stack:
         for prefix, study in named.items():
             stack.enter_context(_alone(study.out))
-            log = partial(_log, study.out / LOG)
+            logs[prefix] = log = partial(_log, study.out / LOG)
             stages, left = pipelines[prefix].stages, to_do[prefix]
             log(f"Study '{study.study.name}': {len(stages)} stages, {len(left)} of them to do")
             if left:
@@ -145,18 +153,20 @@ def run_studies(
                 of_disk = needed[study.out.stat().st_dev]
                 of_disk += [disk_bytes(stage, study, voxels) for stage in left]
                 refuse_small_disk(study.out, sum(of_disk), f"the results of {len(of_disk)} stages need")
-                seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
-                total.seconds |= {prefix + stage.name: of for stage, of in zip(left, seconds, strict=True)}
-                pipelines[prefix].seconds_to_end = seconds_to_end(left, seconds)
+                of_stages = expected(left, study, voxels, cells)
+                expectations |= {prefix + name: one.after(prefix) for name, one in of_stages.items()}
+                pipelines[prefix].seconds_to_end = seconds_to_end(of_stages)
                 if scheduler is None:
-                    _tell(costs(study, stages, left, voxels, cells, workers or usable_cores()), log)
-            logs[prefix] = total.also(log, prefix)
-        run_all(pipelines, pool, logs)
-        total.report(ALL, total.stages, 1.0)
+                    _tell(costs(study, stages, left, voxels, cells, at_once), log)
+        with watch.reporting():
+            run_all(pipelines, pool, logs, watch.ended)
         runs = [StudyRun(study, pipelines[prefix].in_order()) for prefix, study in named.items()]
         for prefix, one in zip(named, runs, strict=True):
-            write_run_report(one.study.out / REPORT, one.study, one.outcomes)
+            if follower.on_end is not None:
+                follower.on_end(one.study, one.outcomes)
+            reports[prefix].whole()
             logs[prefix](f"Report: {one.study.study.out}/{REPORT}")
+        watch.tell(ALL, watch.count, 1.0)
     return runs
 
 
@@ -188,29 +198,6 @@ def _planned(
     if faults:
         raise InputError("The study cannot be run (details: `mrstrain check`):\n  " + "\n  ".join(faults))
     return pipelines, to_do
-
-
-@dataclass(slots=True, eq=False)
-class _TotalProgress:
-    """Overall progress, weighted by the expected time of each stage to be run."""
-
-    report: OnProgress
-    stages: str  # their number, as text
-    seconds: dict[str, float] = field(default_factory=dict)
-    ended_s: float = 0.0
-
-    def also(self, log: Log, prefix: str) -> Log:
-        """A log that also reports progress for each line on a stage that has ended."""
-
-        def line(text: str) -> None:
-            log(text)
-            name = prefix + text.split(": ", maxsplit=1)[0]
-            if name in self.seconds:
-                self.ended_s += self.seconds[name]
-                self.report(name, "ended", 1.0)  # a failed stage has not reported it
-                self.report(ALL, self.stages, round(self.ended_s / sum(self.seconds.values()), 9))
-
-        return line
 
 
 def report(study: Path | str | Study) -> StudyRun:

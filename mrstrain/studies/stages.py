@@ -14,6 +14,8 @@ from dvc.report.page import Section
 from dvc.worker import Worker
 
 Tell = Callable[[str, float], None]
+_REGISTERING = {"aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2)}
+# of a registration's time: when each of its parts begins, and how much of it the part takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +27,7 @@ class StageResult:
     closing: tuple[Section, ...] = ()  # at the end of the report: how to read its part
     complete: bool = True  # False if a model reached only a part of its load
     retry: bool = False  # a part failed in a way that may not recur, so it is run again next time
+    headline: str = ""  # the result in one line
 
     @property
     def verdicts(self) -> list[Verdict]:
@@ -36,15 +39,29 @@ def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **o
     """Register one loaded image; as `mrstrain.measurement.register.register_one`."""
     from mrstrain.measurement.register import register_one
 
-    case = register_one(load0, load, repeat=next(iter(repeat), None), tell=tell, **options)
-    return StageResult(tuple(case.summary()), (case.section,))
+    case = register_one(load0, load, repeat=next(iter(repeat), None), tell=_whole(tell), **options)
+    return StageResult(tuple(case.summary()), (case.section,), headline=case.headline)
+
+
+def _whole(tell: Tell) -> Tell:
+    """Progress of the parts of a registration as that of the whole; a part without a known share leaves it as it is."""
+    reached = 0.0
+
+    def told(part: str, fraction: float) -> None:
+        nonlocal reached
+        begin, share = _REGISTERING.get(part, (reached, 0.0))
+        reached = max(reached, begin + share * fraction)
+        tell(part, reached)
+
+    return told
 
 
 def mesh(tell: Tell, *, labels: Path, **options: Any) -> StageResult:
     """Mesh the soft tissue of a label map; as `mrstrain.mesh`."""
     from mrstrain.models.mesh import mesh as run
 
-    return StageResult(tuple(run(labels, watch=lambda share: tell("meshing", share), **options).summary()))
+    lines = run(labels, watch=lambda share: tell("meshing", share), **options).summary()
+    return StageResult(tuple(lines), headline=lines[0])
 
 
 def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **options: Any) -> StageResult:
@@ -60,7 +77,8 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))
 
     done = run(mesh, loads=steps, workers=1, threads=1, progress=told, **options)
-    return StageResult(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures))
+    headline = "; ".join(one.headline for one in done.sets)
+    return StageResult(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), headline=headline)
 
 
 def drive(tell: Tell, *, sets: Sequence[str], **options: Any) -> StageResult:
@@ -80,7 +98,8 @@ def level(tell: Tell, *, load0: Path, model: Path, load: str, **options: Any) ->
     """Forward-model comparison of one model and load; as `mrstrain.level`."""
     from mrstrain.comparison.level import level as run
 
-    done = run(load0, model, loads=[load], threads=1, progress=lambda _, *stage: tell(*stage), **options)
+    whole = _whole(tell)
+    done = run(load0, model, loads=[load], threads=1, progress=lambda _, *stage: whole(*stage), **options)
     return StageResult(tuple(done.summary()[:-1]))
 
 
@@ -90,4 +109,4 @@ def compare(tell: Tell, **options: Any) -> StageResult:
 
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
     done = run(options.pop("dvc"), models, progress=lambda _, *stage: tell(*stage), **options)
-    return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing)
+    return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing, headline=done.comparison.headline)

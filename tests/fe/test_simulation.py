@@ -92,6 +92,10 @@ def test_what_was_not_reached_comes_back_and_is_marked_everywhere(unreached: fe.
     read = fe.Simulation.read(tmp_path)
     assert (read.complete, read.timed_out) == (False, False)
     assert read.state("far <too> much").reached == share
+    moved = read.state("far <too> much").plate_displacement_mm[0]
+    assert f"far <too> much {moved:.1f}" in unreached.headline
+    assert unreached.headline == read.headline
+    assert unreached.headline.endswith(f" (ONLY {share:.0%} of the load)")
     for words in (str(unreached), str(read)):
         assert f"far <too> much: ONLY {share:.0%} of the load was reached" in words
         assert "never was not tried" in words

@@ -115,6 +115,15 @@ def test_a_notebook_shows_the_answer_the_areas_and_the_curves(comparison: Compar
     assert base64.b64decode(image[1]).startswith(b"\x89PNG")
 
 
+def test_the_headline_is_the_best_match_or_the_area_of_the_best(comparison: Comparison) -> None:
+    best_match = next(line for line in comparison.ranking.statements if line.startswith("Best match"))
+    doubt = "Load2: less than 1 % of the tissue exceeds 0.2, so the area metric is not informative."
+    ranking = replace(comparison.ranking, statements=(doubt, best_match))
+    assert comparison.headline == replace(comparison, ranking=ranking).headline == best_match
+    without = replace(comparison, ranking=replace(comparison.ranking, statements=(doubt,)))
+    assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: area between curves ")
+
+
 def test_plots_draw_the_curves_and_areas_themselves(comparison: Comparison) -> None:
     figure = comparison.plot()
     assert [axes.get_title() for axes in figure.axes] == ["Load1", "Load2"]

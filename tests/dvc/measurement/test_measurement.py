@@ -134,6 +134,16 @@ def test_a_deformation_from_elsewhere_is_a_measurement_too(stretched, tmp_path):
         stretched.plot("sigma")
 
 
+def test_the_headline_is_of_the_region_with_most_strain(stretched):
+    strain = "0.053 median, 0.053 at the 95th percentile"  # (1.1² - 1) / 4
+    assert stretched.headline == f"max. shear strain in fat {ATTACK} {strain}; {stretched.verdict.words}"
+    (shear,) = (row for row in stretched.regions if row.quantity == "max_shear")
+    small = replace(shear, region="tendon", median=0.2, volume_ml=0.1 * shear.volume_ml)
+    none = replace(shear, region="gap", median=float("nan"))
+    assert replace(stretched, regions=(none, small, shear)).headline == stretched.headline
+    assert replace(stretched, regions=(none,)).headline.startswith("no maximum shear strain; ")
+
+
 def test_labels_of_another_grid_are_refused_before_anything_is_registered(tiny_pair):
     labels = replace(tiny_pair.labels, grid=tiny_pair.labels.grid.moved_by(np.eye(3), np.ones(3)))
     settings = Settings(dvc.GaussNewton())  # which does not need them

@@ -85,7 +85,7 @@ def spy(monkeypatch, scans, tiny_pair) -> Spy:
     monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", one.register)
 
     def written(_plan: Plan, folder: Path, _done: Registered, _floor: NoiseFloor | None) -> tuple[Case, None]:
-        return Case(folder, Section(folder.name, Verdict("trust")), ()), None
+        return Case(folder, Section(folder.name, Verdict("trust")), (), ""), None
 
     monkeypatch.setattr(Plan, "write", written)
     return one

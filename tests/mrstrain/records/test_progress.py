@@ -51,28 +51,31 @@ def test_cases_and_stages_have_clocks_of_their_own(clock: list[float], capsys: p
     ]
 
 
-def test_of_many_stages_a_pipe_gets_the_line_of_all_alone(
+def test_of_many_stages_a_pipe_gets_a_line_for_each_that_ended_with_the_time_left(
     clock: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with progress.live(of_all=True) as told:
+        told("all", "0 of 40 stages", 0.0)
         for second in range(121):  # two minutes of a stage that tells every second
             clock[0] = 1000.0 + second
-            told("Ada: register Load1", "aligning" if second < 30 else "registering", second / 200)
-        told("Ada: register Load1", "ended", 1.0)
-        told("all", "40 stages", 0.5)
-        for share in (0.6, 0.7, 0.8):  # there already, all at once
-            told("all", "40 stages", share)
+            told("Ada: register Load1", "registering", second / 200)
+            told("all", "0 of 40 stages", second / 240)
+        told("Ada: register Load1", "max. shear strain in fat 0.131 median; Trust", 1.0)
+        told("all", "1 of 40 stages", 0.5)
+        told("all", "2 of 40 stages", 0.6)  # there already
         clock[0] = 1180.0
-        told("Ben: mesh", "meshing", 0.5)
-        told("Ben: mesh", "meshing", 0.6)
-        told("all", "40 stages", 1.0)
+        told("Ben: mesh", "35,000 tetrahedra", 1.0)
+        told("all", "40 of 40 stages", 0.999)
+        told("all", "40 of 40 stages", 1.0)
     lines = capsys.readouterr()
     assert lines.out == ""
     assert lines.err.splitlines() == [
-        "all: begun 0 % after 60 s",
-        "all: begun 0 % after 120 s",
-        "all: 40 stages 80 % after 180 s, 45 s left",
-        "all: 40 stages 100 % after 180 s",
+        "all (0 of 40 stages after 60 s, about 3 min left)",
+        "all (0 of 40 stages after 2 min, about 2 min left)",
+        "Ada: register Load1: max. shear strain in fat 0.131 median; Trust (1 of 40 stages after 2 min, about 2 min "
+        "left)",
+        "Ben: mesh: 35,000 tetrahedra (40 of 40 stages after 3 min, about 0 s left)",
+        "all (40 of 40 stages after 3 min)",
     ]
 
 
@@ -93,11 +96,14 @@ def test_thirty_ended_stages_do_not_push_the_running_one_off_the_screen() -> Non
         assert begun[0].startswith("all")
         for number in range(30):
             told(f"simulate set-{number}", "Load1", 0.5)
-            told(f"simulate set-{number}", "Load1", 1.0)
+            told(f"simulate set-{number}", f"plate displacement [{number}] mm", 1.0)
             told("all", "40 stages", (number + 1) / 40)
         told("register Load4", "registering", 0.25)
         time.sleep(0.5)  # drawn ten times a second
         shown = screen(file.getvalue(), 24)
     assert [line.split("%")[0].split()[0] for line in shown] == ["all:", "register"]
     assert "75 %" in shown[0]
+    assert "left" in shown[0]
     assert "25 %" in shown[1]
+    for number in range(30):  # above the bars, once each
+        assert file.getvalue().count(f"simulate set-{number}: plate displacement [{number}] mm") == 1

@@ -21,7 +21,7 @@ from mrstrain.studies.file import read_study
 from mrstrain.studies.ledger import StageRecord
 from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import plan
-from mrstrain.studies.run import StudyRun, run
+from mrstrain.studies.run import StudyRun, run_studies
 from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import read_errors, write_errors
 from mrstrain.truth.phantom import phantom
@@ -123,13 +123,19 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     (load2,) = (load for load in LOADS if load.name == "Load2")
     monkeypatch.setattr(demonstration, "LOADS", [load2])
     monkeypatch.setattr(demonstration, "phantom", partial(phantom, spacing_mm=2.3, loads=["Load2"]))
-    monkeypatch.setattr(demonstration, "run", partial(run, only=["register Load2"]))
+    monkeypatch.setattr(demonstration, "run_studies", partial(run_studies, only=["register Load2"]))
     demonstration._make(tmp_path / "demo", 3, False, None)
     quick = "[registration]\nborders = false\nbending = 3.0\nvolume = 300.0\n"
     study = tmp_path / "demo" / "study.toml"
     assert "[registration]" not in study.read_text()
     study.write_text(study.read_text() + quick)
-    shown = demonstration.demo(tmp_path / "demo", seed=3)
+    pages, told = [], []
+    shown = demonstration.demo(
+        tmp_path / "demo", seed=3, progress=lambda *event: told.append(event), on_report=pages.append
+    )
+    assert pages == [tmp_path / "demo" / "results" / "report.html"]
+    found = [what for case, what, fraction in told if case == "register Load2" and fraction == 1.0]
+    assert re.fullmatch(r"max\. shear strain in \w+ [\d.]+ median, [\d.]+ at the 95th percentile; .*", *found)
     assert not shown.complete  # the rest has no result
     assert shown.lines[0].startswith("Verdicts on the registrations: Load2 ")
     error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) of ([\d.]+)", shown.lines[1]).groups())
@@ -144,7 +150,9 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     assert shown.lines[-1] == f"Report: {report}"
     assert "Error against the truth" in report.read_text()
     before = (tmp_path / "demo" / "error.csv").read_bytes()
-    assert demonstration.demo(tmp_path / "demo", seed=3).lines == shown.lines  # nothing is done again
+    again = demonstration.demo(tmp_path / "demo", seed=3, on_report=pages.append)
+    assert again.lines == shown.lines  # nothing is done again
+    assert len(pages) == 1  # nor shown
     assert (tmp_path / "demo" / "error.csv").read_bytes() == before
 
 
