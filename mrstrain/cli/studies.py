@@ -7,16 +7,26 @@ from typing import Annotated
 import typer
 
 import mrstrain
+from mrstrain.cli.browser import can_open, show
 from mrstrain.cli.options import Done, Out, P, Workers, tell
 
 StudyFile = Annotated[Path, typer.Argument(help="The study file, or its folder.")]
+NoOpen = Annotated[
+    bool,
+    typer.Option(
+        "--no-open",
+        help="Do not open the report in a browser. By default it opens at its first picture, if there is a display.",
+        envvar="MRSTRAIN_NO_OPEN",
+        rich_help_panel="Output",
+    ),
+]
 Scheduler = Annotated[
     str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://node1:8786; see docs/cluster.md.")
 ]
 
 
 def _carry_out(work: Callable[P, Done], *given: P.args, **options: P.kwargs) -> None:
-    """As `carry_out`, for functions that report the progress of all stages together, too."""
+    """As `carry_out`, for functions that report the progress of all stages together and what each found, too."""
     from mrstrain.records.progress import live
 
     with live(of_all=True) as progress:
@@ -57,6 +67,7 @@ def run(
     report_only: Annotated[bool, typer.Option("--report-only", help="Only write the report again.")] = False,
     scheduler: Scheduler = None,
     workers: Workers = None,
+    no_open: NoOpen = False,
 ) -> None:
     """Run a study from its file to its report: register, mesh, simulate, compare. An interrupted run resumes."""
     from mrstrain.studies.run import forecast, report
@@ -70,7 +81,10 @@ def run(
         for name, told in forecast(study, only=only or (), force=force or ()).items():
             typer.echo(f"{name}: {told}")
     else:
-        _carry_out(mrstrain.run, study, only=only or (), force=force or (), scheduler=scheduler, workers=workers)
+        _carry_out(
+            mrstrain.run, study, only=only or (), force=force or (), scheduler=scheduler, workers=workers,
+            on_report=None if no_open or not can_open() else show,
+        )  # fmt: skip
 
 
 def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
@@ -102,8 +116,10 @@ def demo(
         ),
     ] = False,
     workers: Workers = None,
+    no_open: NoOpen = False,
 ) -> None:
     """Run a whole study on a heel phantom with known strain under four loads: error by tissue, and a report."""
     from mrstrain.studies.demo import demo as run
 
-    _carry_out(run, out, seed=seed, full=full, workers=workers)
+    on_report = None if no_open or not can_open() else show
+    _carry_out(run, out, seed=seed, full=full, workers=workers, on_report=on_report)
