@@ -1,5 +1,6 @@
 """The commands of a whole study. They parse, call one function, and print."""
 
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
@@ -41,9 +42,20 @@ def init(
     name: Annotated[
         str, typer.Option(help="Name of the subject in the report; must not identify a patient.")
     ] = "Subject 01",
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Ask nothing. Nothing is asked outside a terminal, either.")
+    ] = False,
 ) -> None:
-    """Write a commented study file for the contents of a folder."""
-    tell(mrstrain.init(folder, name=name))
+    """Write a commented study file for the contents of a folder, and a picture of them.
+
+    In a terminal, asks what the files do not tell: the bone, the forces and the plate's directions.
+    """
+    if yes or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        tell(mrstrain.init(folder, name=name))
+        return
+    from mrstrain.cli.questions import ask
+
+    tell(mrstrain.init(folder, name=name, ask=ask))
 
 
 def check(study: StudyFile, workers: Workers = None) -> None:

@@ -1,13 +1,15 @@
 """`init`: writes a study file from the files in a folder."""
 
 import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
 import jinja2
 
-from dvc.atomic_files import write_whole
+from dvc import read_image, read_labels
+from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, OutputError
 from dvc.io.images.dicom import is_dicom, is_multiframe
 from fe import published_names
@@ -29,6 +31,7 @@ _ROLES = {
     "repeat": "the repeat scan", "load": "the load of that name",
 }  # fmt: skip
 _LOOKED_AT = 20
+PICTURE = "study.png"
 _TO_FILL_IN = "# FILL IN"  # of lines in the template
 _TABLES = (".csv", ".txt", ".label", ".ctbl")
 
@@ -50,11 +53,23 @@ class StudyInputs:
 
 
 @dataclass(frozen=True, slots=True)
+class Answers:
+    """What the files of a folder do not tell, as far as it is known; forces in N, directions LPS."""
+
+    bone: str | None = None  # name of its label
+    bone_mask: str | None = None  # or the file of a mask of it
+    forces: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # normal and shear, by load
+    normal: tuple[float, float, float] | None = None  # of the plate, outward
+    shear_direction: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class NewStudy:
-    """The study file that `init` wrote, and the files that it names."""
+    """The study file that `init` wrote, the files that it names, and a picture of them or why there is none."""
 
     path: Path
     inputs: StudyInputs
+    picture: Path | str
 
     def summary(self) -> list[str]:
         """Summary, a few lines: what was found and what is left to do."""
@@ -63,13 +78,18 @@ class NewStudy:
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
-        lines += [f"Study file: {self.path}. Fill in the following lines, and remove the # at their beginning:"]
         file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)
-        lines += [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
-        return [*lines, f"Next step: mrstrain check {self.path.parent}"]
+        to_fill_in = [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
+        todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
+        lines += [f"Study file: {self.path}.{todo}", *to_fill_in, f"Next step: mrstrain check {self.path.parent}"]
+        return [*lines, f"Picture of what was found: {self.picture}"]
 
 
-def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
+Ask = Callable[[StudyInputs, Sequence[str], Path | str], Answers]
+"""``ask(inputs, names of the labels, picture or why there is none)`` gives what the files do not tell."""
+
+
+def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None) -> NewStudy:
     """Write a commented study file from the files in a folder.
 
     Parameters
@@ -78,6 +98,9 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
         Folder with the images, the label map and its names, and optionally results of other codes in subfolders.
     name : str
         Name of the study in its report. It must not identify a patient, and must be unique in a cohort.
+    ask : callable, optional
+        ``ask(inputs, names of the labels, picture)`` returns `Answers`: the bone, forces and the directions of the
+        plate.
 
     Raises
     ------
@@ -93,14 +116,37 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
     if target.exists():
         raise OutputError(f"{target} already exists; remove it to write a new one.")
     found = _look(place)
+    picture, names = _drawn(place, found)
+    answers = Answers() if ask is None else ask(found, names, picture)
+    found.unused.pop(answers.bone_mask or "", None)
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # TOML has no surrogate pairs
     source = files("mrstrain.studies") / "templates" / "study.toml.j2"
     template = environment.from_string(source.read_text(encoding="utf-8"))
     forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
     sets = [name for name in published_names() if not name.endswith(_VARIANT) and name != _SOFTEST]
-    write_whole(target, template.render(found=found, name=name, forces=forces, sets=sets))
-    return NewStudy(target, found)
+    write_whole(target, template.render(found=found, name=name, answers=answers, forces=forces, sets=sets))
+    return NewStudy(target, found, picture)
+
+
+def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
+    """The picture of the images, or why there is none, and the names of the labels."""
+    from mrstrain.studies.picture import Outlined, overview
+
+    try:
+        if found.load0 is None:
+            raise InputError("no unloaded image was found")
+        unloaded = read_image(place / found.load0, allow_missing=True)
+        labels = (
+            None if found.labels is None else read_labels(place / found.labels, found.names and place / found.names)
+        )
+        others = {load: read_image(place / image, allow_missing=True) for load, image in found.loads.items()}
+        names = [] if labels is None else [name for number, name in labels.names.items() if number != 0]
+        with whole_file(place / PICTURE) as file:
+            file.write_bytes(overview(Outlined.of(unloaded, labels), others))
+    except InputError as error:
+        return f"none, {error}", []
+    return place / PICTURE, names
 
 
 def _look(place: Path) -> StudyInputs:

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import subprocess
+import sys
 import tomllib
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image as Pixels
 from pydantic import BaseModel
 
 from dvc.errors import InputError
+from dvc.io.images.write import write_image, write_labels, write_mask
+from mrstrain.cli.questions import ask
 from mrstrain.studies.check import check
 from mrstrain.studies.file import Load, Study, keys_of, read_study
-from mrstrain.studies.init import init
+from mrstrain.studies.init import NewStudy, init
+from mrstrain.studies.picture import Outlined
 
 
 def folder_of(place: Path, *names: str) -> Path:
@@ -94,9 +105,9 @@ def test_every_force_that_is_to_be_put_in_is_told_with_its_line_by_init_and_by_c
     begun = init(folder_of(tmp_path, "Load0.nii.gz", "Load 1.nii.gz", "Load2.nii.gz", "tissues.nii.gz"))
     lines = begun.path.read_text().splitlines()
     first, second = (number for number, line in enumerate(lines, start=1) if line.startswith("# normal_n ="))
-    told = [line.strip().split(" = ")[0] for line in begun.summary()[-4:-1]]
+    told = [line.strip().split(" = ")[0] for line in begun.summary()[-5:-2]]
     assert told == ["line 12: names", f"line {first}: normal_n", f"line {second}: normal_n"]
-    assert 'force under "Load 1", N' in begun.summary()[-3]
+    assert 'force under "Load 1", N' in begun.summary()[-4]
     places = [f"line {first}: [loads.Load 1] 'normal_n'", f"line {second}: [loads.Load2] 'normal_n'"]
     (told,) = (one for one in check(tmp_path).wrong if "normal_n" in one)
     assert [line.strip() for line in told.splitlines()[1:]] == places
@@ -131,3 +142,122 @@ def test_enhanced_dicom_files_are_found_and_single_slices_left_alone(tmp_path, m
     monkeypatch.setattr("mrstrain.studies.init.is_multiframe", lambda path: path.stem in ("Load0", "Load1"))
     found = init(tmp_path).inputs
     assert (found.load0, found.loads, found.unused) == ("Load0.dcm", {"Load1": "Load1.DCM"}, {})
+
+
+def heel_in(folder: Path, pair) -> Path:
+    """A folder with a small heel, its label map, two loads and a mask without a role."""
+    write_image(folder / "Load0.nii.gz", pair.reference)
+    write_image(folder / "Load1.nii.gz", pair.loaded)
+    write_image(folder / "Load2.nii.gz", pair.repeat)
+    write_labels(folder / "tissues.nii.gz", pair.labels)
+    write_mask(folder / "os-calcis.nii.gz", pair.labels.region("bone"))
+    return folder
+
+
+def test_a_picture_shows_what_was_found(tmp_path, tiny_pair):
+    begun = init(heel_in(tmp_path, tiny_pair))
+    assert begun.picture == tmp_path / "study.png"
+    assert begun.summary()[-1] == f"Picture of what was found: {tmp_path / 'study.png'}"
+    with Pixels.open(begun.picture) as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    assert pixels.shape[0] > 600  # two rows: the unloaded image in three planes, and two loads
+    for colour in ((0, 0x72, 0xB2), (0xD5, 0x5E, 0)):  # outlines of bone and of fat
+        assert (np.abs(pixels - colour).sum(axis=-1) < 30).sum() > 200
+
+
+def test_no_picture_is_no_reason_to_write_no_study_file(tmp_path):
+    begun = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "tissues.nii.gz"))
+    assert begun.path.is_file()
+    assert not (tmp_path / "study.png").exists()
+    assert re.fullmatch(r"Picture of what was found: none, .*Load0\.nii\.gz.*", begun.summary()[-1])
+    (tmp_path / "study.toml").unlink()
+    (tmp_path / "Load0.nii.gz").unlink()
+    assert init(tmp_path).summary()[-1] == "Picture of what was found: none, no unloaded image was found"
+
+
+def test_labels_that_lie_elsewhere_are_left_out_of_the_picture(tiny_pair):
+    far = replace(tiny_pair.labels.grid, origin_mm=tiny_pair.labels.grid.origin_mm + 1000.0)
+    assert set(Outlined.of(tiny_pair.reference, tiny_pair.labels).regions) == set(tiny_pair.labels.names.values())
+    assert Outlined.of(tiny_pair.reference, replace(tiny_pair.labels, grid=far)).regions == {}
+
+
+def answering(*lines: str):
+    """A console that gives these lines one after the other, then none; and what it was asked."""
+    asked, left = [], list(lines)
+
+    def read(question: str) -> str:
+        asked.append(question)
+        if not left:
+            raise EOFError
+        return left.pop(0)
+
+    return read, asked
+
+
+def asked_init(place: Path, *lines: str) -> tuple[NewStudy, list[str]]:
+    read, asked = answering(*lines)
+    (place / "study.toml").unlink(missing_ok=True)
+    return init(place, ask=partial(ask, read=read)), asked
+
+
+def test_answers_stand_in_the_study_file(tmp_path, tiny_pair, capsys):
+    place = heel_in(tmp_path, tiny_pair)
+    begun, asked = asked_init(
+        place, "heel", "ankle", "-5", "abc", "140 N", "", "15", "-45,5", "0 0.1 -1", "1 0", "[0, 1, 0]"
+    )
+    assert [question.split(",")[0].split(" [")[0] for question in asked] == [
+        *["Bone: its label (bone"] * 2, *["Load1: normal force"] * 3, "Load1: shear force", "Load2: normal force",
+        "Load2: shear force", "Plate: outward normal", *["Plate: direction of the shear force on the tissue"] * 2,
+    ]  # fmt: skip
+    assert asked[0].endswith("or the file of its mask [bone]: ")
+    told = capsys.readouterr().out
+    assert "'heel': there are bone, fat" in told
+    assert "'-5': the normal force presses, so it is positive." in told
+    assert "'abc': a number is needed" in told
+    assert "'1 0': three numbers are needed" in told
+    study = read_study(place)
+    assert (study.bone, study.images.bone, study.mesh.bones) == ("ankle", None, ("ankle",))
+    forces = {name: (load.normal_n, load.shear_n) for name, load in study.loads.items()}
+    assert forces == {"Load1": (140.0, 0.0), "Load2": (15.0, -45.5)}
+    assert study.plate.plate_normal == (0.0, 0.1, -1.0)
+    assert study.plate.shear_direction == (0.0, 1.0, 0.0)
+    assert not any("line" in line for line in begun.summary())  # nothing is left to fill in
+
+
+def test_the_bone_may_be_the_file_of_a_mask(tmp_path, tiny_pair):
+    begun, _ = asked_init(heel_in(tmp_path, tiny_pair), "os-calcis.nii.gz")
+    assert read_study(tmp_path).images.bone == Path("os-calcis.nii.gz")
+    assert not any("NOT USED" in line for line in begun.summary())
+
+
+def test_every_question_can_be_skipped(tmp_path, tiny_pair):
+    place = heel_in(tmp_path, tiny_pair)
+    init(place)
+    unasked = (place / "study.toml").read_text()
+    for lines in ((), ("",) * 9):  # the end of the input, and Enter
+        begun, _ = asked_init(place, *lines)
+        assert begun.path.read_text() == unasked
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no pseudo-terminals")
+@pytest.mark.parametrize(("options", "asks"), [((), True), (("--yes",), False)])
+def test_a_terminal_is_asked_and_a_pipe_is_not(tmp_path, tiny_pair, options, asks):
+    place = heel_in(tmp_path, tiny_pair)
+    command = [sys.executable, "-m", "mrstrain", "init", str(place), *options]
+    outside, inside = os.openpty()
+    process = subprocess.Popen(command, stdin=inside, stdout=inside, stderr=inside)
+    os.close(inside)
+    told, answers = b"", [b"\n", b"140\n", b"\n", b"\n", b"\n"]
+    with contextlib.suppress(OSError):  # its end, as Linux tells it
+        while got := os.read(outside, 4096):
+            told += got
+            if told.endswith(b"]: "):
+                os.write(outside, answers.pop(0))
+    os.close(outside)
+    assert process.wait() == 0, told
+    assert (b"Load1: normal force, N [later]: " in told) == asks
+    assert read_study(place).loads["Load1"].normal_n == (140.0 if asks else None)
+    assert told.splitlines()[-1].startswith(b"Picture of what was found: ")
+    (place / "study.toml").unlink()
+    piped = subprocess.run(command, input="", capture_output=True, text=True, check=True)
+    assert "normal force, N [" not in piped.stdout

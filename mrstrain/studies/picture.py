@@ -1,0 +1,92 @@
+"""The picture that `init` draws: the unloaded image with what is labelled on it, and every other image beside it."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from dvc import Image, LabelMap, fit_mask
+from dvc.arrays import BoolArray
+from dvc.errors import GeometryError
+from dvc.report.figures import REGION_COLOURS
+from dvc.report.sheet import (
+    FONT,
+    INK,
+    LETTERS,
+    PLANES,
+    SHADOW,
+    UNSEEN,
+    Plane,
+    View,
+    outline,
+    panels,
+    png_bytes,
+    scale_bar,
+    window_of,
+)
+
+_COLOURS = (*REGION_COLOURS[:-1], "#F0E442")  # black would not show
+_IN_A_ROW, _PANEL_IN = 3, (9.8, 3.3)
+
+
+@dataclass(frozen=True, slots=True)
+class Outlined:
+    """An image, and what is outlined on its voxels: masks by name."""
+
+    image: Image
+    regions: Mapping[str, BoolArray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, image: Image, labels: LabelMap | None) -> Self:
+        """An image with its label map, which is left out where it lies elsewhere."""
+        try:
+            on_image = None if labels is None else fit_mask(labels, image.grid, "label map")
+        except GeometryError:
+            on_image = None
+        names = {} if on_image is None else on_image.names
+        return cls(image, {name: on_image.labels == n for n, name in names.items() if on_image is not None and n != 0})
+
+
+def overview(unloaded: Outlined, others: Mapping[str, Image]) -> bytes:
+    """Middle slices of the unloaded image in three planes with the outlines of its labels, and one of every other.
+
+    A PNG file's bytes. The slices meet in the middle of what is labelled, or of the image; letters are sides of the
+    body.
+    """
+    inside = [mask for mask in unloaded.regions.values() if mask.any()]
+    grid = unloaded.image.grid
+    middle = grid.centre_mm if not inside else grid.points(sum(inside[1:], inside[0])).mean(axis=0)
+    shown = [("Load0", unloaded, plane) for plane in PLANES]
+    shown += [(name, Outlined(image), PLANES[0]) for name, image in others.items()]
+    figure, spots = panels(len(shown), _IN_A_ROW, _PANEL_IN)
+    for axes, (name, one, plane) in zip(spots, shown, strict=True):
+        at = middle if one.image.grid.contains(middle) else one.image.grid.centre_mm
+        view = View.through(one.image.grid, at)
+        _slice(axes, view, plane, one)
+        axes.set_title(f"{name}: {view.title(plane).lower()}", loc="left", color=INK, fontsize=9.5)
+    lines = [Line2D([], [], color=colour, label=name) for name, _, colour in _coloured(unloaded)]
+    if lines:
+        figure.legend(handles=lines, loc="outside lower center", ncols=6, frameon=False, prop={"size": 9.5})
+    return png_bytes(figure)
+
+
+def _coloured(one: Outlined) -> Iterator[tuple[str, BoolArray, str]]:
+    """Each region with its colour."""
+    for number, (name, mask) in enumerate(one.regions.items()):
+        yield name, mask, _COLOURS[number % len(_COLOURS)]
+
+
+def _slice(axes: Axes, view: View, plane: Plane, one: Outlined) -> None:
+    """Draw a slice with its outlines, the sides of the body and a scale."""
+    extent = view.extent_mm(plane)
+    low, high = window_of(view, one.image.values)
+    axes.imshow(view.cut(one.image.values, plane), extent=extent, cmap="gray", vmin=low, vmax=high)
+    for _, mask, colour in sorted(_coloured(one), key=lambda region: -region[1].sum()):  # small ones over large ones
+        outline(axes, extent, [view.cut(mask, plane)], colour)
+    axes.set(xticks=[], yticks=[], facecolor=UNSEEN, xlim=extent[:2], ylim=extent[2:])
+    white: dict[str, Any] = {"color": "white", "weight": "bold", "path_effects": SHADOW, "transform": axes.transAxes}
+    for letter, x, y in zip(LETTERS[plane], (0.03, 0.97, 0.5, 0.5), (0.5, 0.5, 0.96, 0.04), strict=True):
+        axes.text(x, y, letter, ha="center", va="center", **white, **FONT)
+    scale_bar(axes, extent[1] - extent[0])
