@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -15,10 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
-from dvc.atomic_files import whole_file
-from dvc.report.figures import REGION_COLOURS
-from dvc.report.sheet import FONT, INK, WIDTH_IN, chart, label_axes, letters, panels, png_bytes
+from dvc.report.chart import chart, colour_bar, empty, label_axes, legend
+from dvc.report.figures import MAX_SHEAR
+from dvc.report.sheet import letters, name_sides, scale_bar, slice_panel
+from dvc.report.style import FONT, GRID, INK, ON_LIGHT, RULE, TISSUES, WIDTH_IN, Look, looks
 from fe.convergence import Limit
+from fe.materials import MODES
 from fe.mesh_file import BONE
 from fe.plate import Plate
 from fe.result import volume_percentiles
@@ -30,14 +32,9 @@ if TYPE_CHECKING:
 _POINTS = 200
 _FLAT_MM = 0.1
 _STEEPEST = 0.05  # smallest component of the plate's normal along the normal force at which the plate is drawn
-_MARGIN_MM = 7.0  # around the mesh, for the letters
+_MARGIN_MM = 7.0  # around what is drawn, for the letters
+_GAP_IN, _TITLE_IN, _BAR_IN, _TALLEST_IN, _NARROWEST_IN = 0.1, 0.3, 0.66, 4.6, 5.2
 _UNKNOWN = "#c9ced6"
-
-
-def write_figure(path: Path, figure: Figure) -> None:
-    """Write a figure as PNG."""
-    with whole_file(path) as part:
-        part.write_bytes(png_bytes(figure))
 
 
 def stress_stretch(curves: "Sequence[Curve]", fitted: "Fit") -> Figure:
@@ -46,20 +43,22 @@ def stress_stretch(curves: "Sequence[Curve]", fitted: "Fit") -> Figure:
     Dashed lines: the model is not stable there (Drucker).
     """
     figure, (axes,) = chart()
-    for curve, colour in zip(curves, cycle(REGION_COLOURS), strict=False):
+    look = looks([curve.mode for curve in curves], list(MODES))
+    for curve in curves:
         low, high = fitted.reached[curve.mode]
         margin = 0.05 * (high - low)
         stretch = np.linspace(low - margin, high + margin, _POINTS)
         stress = 1000.0 * fitted.material.nominal_stress(stretch, curve.mode)
         least, greatest = fitted.stable[curve.mode]
-        stable = (stretch >= least) & (stretch <= greatest)
-        axes.plot(stretch, np.where(stable, stress, np.nan), color=colour, linewidth=1.8, label=curve.mode)
+        stable, of_test = (stretch >= least) & (stretch <= greatest), look[curve.mode]
+        axes.plot(stretch, np.where(stable, stress, np.nan), label=curve.mode, **of_test.line)
         if not stable.all():
-            axes.plot(stretch, np.where(stable, np.nan, stress), color=colour, linewidth=1.8, linestyle="--")
-        axes.plot(curve.stretch, 1000.0 * curve.stress_mpa, "o", color=colour, markersize=4, markerfacecolor="white")
-    axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
-    label_axes(axes, "stretch", "nominal stress, kPa")
-    axes.legend(fontsize=9, frameon=False)
+            axes.plot(stretch, np.where(stable, np.nan, stress), **of_test.line | {"linestyle": "--"})
+        points = of_test.marked | {"linestyle": "none", "markerfacecolor": "white"}
+        axes.plot(curve.stretch, 1000.0 * curve.stress_mpa, **points)
+    axes.axhline(0.0, color=RULE, linewidth=0.8)
+    label_axes(axes, "stretch, no unit", "nominal stress, kPa")
+    legend(axes)
     return figure
 
 
@@ -107,36 +106,61 @@ def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_
     """Fields in one slice, with one colour scale that ends at the 99th percentile (by volume).
 
     Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left. ``axes`` (3,
-    3) are those of the plate: columns are the directions of the normal force, of shear, and their cross product, LPS.
-    ``point_mm`` (3,) lies in the slice, reference configuration, LPS mm.
+    3) are those of the plate: columns are the directions of the normal force (up), of shear (to the right), and their
+    cross product, LPS. ``point_mm`` (3,) lies in the slice, reference configuration, LPS mm.
     """
     cuts = [cut(mesh, field.u_mm, axes, point_mm) for field in fields]
-    corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
-    low, high = corners.min(axis=0) - _MARGIN_MM, corners.max(axis=0) + _MARGIN_MM
     shears = np.concatenate([field.max_shear for field in fields])
     known = np.isfinite(shears)
     (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(fields))[known], [0.99])
-    largest = max(0.05, float(np.ceil(20.0 * most) / 20.0))
-    tall = 0.9 + (WIDTH_IN / min(len(fields), 2) - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
-    figure, spots = panels(len(fields), size_in=(WIDTH_IN, tall))
+    norm = Normalize(0.0, max(0.05, float(np.ceil(20.0 * most) / 20.0)))
     shades = colormaps["viridis"].with_extremes(bad=_UNKNOWN)
-    how: dict[str, Any] = {"cmap": shades, "norm": Normalize(0.0, largest), "edgecolors": "face", "linewidths": 0.2}
+    corners = [corner for _, polygons in cuts for corner in polygons]
+    figure, spots, bar = _slice_panels([field.title for field in fields], corners, axes, bar=True)
     for spot, field, (cells, polygons) in zip(spots, fields, cuts, strict=True):
-        drawn = PolyCollection(polygons, array=np.ma.masked_invalid(field.max_shear[cells]), **how)
-        spot.add_collection(drawn)
-        spot.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        values = np.ma.masked_invalid(field.max_shear[cells])
+        how: dict[str, Any] = {"cmap": shades, "norm": norm, "edgecolors": "face", "linewidths": 0.2}
+        spot.add_collection(PolyCollection(polygons, array=values, rasterized=True, **how), autolim=False)
         if field.face is not None:
             spot.axline((0.0, field.face[0]), slope=field.face[1], color=INK, linewidth=1.0, linestyle="--")
-        label_axes(spot, "along the shear, mm", "along the normal force, mm", field.title)
-        for x, y, ha, va, direction in (
-            (0.01, 0.5, "left", "center", -axes[:, 1]), (0.99, 0.5, "right", "center", axes[:, 1]),
-            (0.5, 0.01, "center", "bottom", -axes[:, 0]), (0.5, 0.99, "center", "top", axes[:, 0]),
-        ):  # fmt: skip
-            side, at = letters(direction), spot.transAxes
-            spot.text(x, y, side, weight="bold", color=INK, transform=at, ha=ha, va=va, **FONT)
-    bar = figure.colorbar(drawn, ax=spots, shrink=0.8, extend="max")
-    bar.set_label("max. shear strain", color=INK, **FONT)
+    assert bar is not None
+    colour_bar(bar, ScalarMappable(norm, shades), MAX_SHEAR, "max")
     return figure
+
+
+def _slice_panels(
+    titles: Sequence[str], corners: Sequence[FloatArray], axes: FloatArray, bar: bool = False
+) -> tuple[Figure, list[Axes], Axes | None]:
+    """Panels for a slice along the first two of the plate's axes, around polygons, with letters and a scale bar.
+
+    With ``bar`` also room for a colour bar.
+    """
+    every = np.concatenate(corners)
+    low, high = every.min(axis=0) - _MARGIN_MM, every.max(axis=0) + _MARGIN_MM
+    width_mm, height_mm = high - low
+    columns = min(len(titles), 2)
+    rows = -(-len(titles) // columns)
+    inches = min((WIDTH_IN - _GAP_IN * (columns - 1)) / columns / width_mm, _TALLEST_IN / height_mm)
+    w, h = inches * width_mm, inches * height_mm
+    foot = _BAR_IN * bar + _GAP_IN
+    size = max(_NARROWEST_IN, columns * (w + _GAP_IN) - _GAP_IN), rows * (h + _TITLE_IN) + foot
+    figure, spots, indent = empty(size), [], (size[0] - columns * (w + _GAP_IN) + _GAP_IN) / 2
+    for number, title in enumerate(titles):
+        left = indent + number % columns * (w + _GAP_IN)
+        bottom = foot + (rows - 1 - number // columns) * (h + _TITLE_IN)
+        spot = slice_panel(figure, (left / size[0], bottom / size[1], w / size[0], h / size[1]), "white")
+        spot.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        spot.spines[:].set_color(GRID)
+        spot.set_title(title, pad=4, color=INK, **FONT)
+        sides = map(letters, (-axes[:, 1], axes[:, 1], axes[:, 0], -axes[:, 0]))
+        name_sides(spot, sides, **ON_LIGHT)
+        scale_bar(spot, width_mm, **ON_LIGHT)
+        spots.append(spot)
+    if not bar:
+        return figure, spots, None
+    length = 0.43 * size[0]
+    at = (0.5 * (size[0] - length) / size[0], 0.45 / size[1], length / size[0], 0.13 / size[1])
+    return figure, spots, figure.add_axes(at)
 
 
 def _lowest_bone_point(mesh: TetMesh, axes: FloatArray) -> FloatArray:
@@ -170,44 +194,47 @@ def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray)
 
 def force_displacement(states: Sequence[LoadState]) -> Figure:
     """Force of the plate over its displacement from first contact on, along the normal (left) and the shear (right)."""
-    figure, spots = chart(2)
+    figure, spots = chart(2, page_wide=True)
+    look = looks(state.load.name for state in states)
     for axes, axis, name in zip(spots, (0, 1), ("normal", "shear"), strict=True):
-        for state, colour in zip(states, cycle(REGION_COLOURS), strict=False):
+        for state in states:
             moved, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("displacement_mm", "force_n"))
-            axes.plot(moved, force, marker=".", label=state.load.name, linewidth=1.8, color=colour)
+            axes.plot(moved, force, label=state.load.name, **look[state.load.name].marked)
         label_axes(axes, f"{name} displacement, mm", f"{name} force, N")
-    spots[0].legend(fontsize=9, frameon=False)
+    legend(spots[0])
     return figure
 
 
 def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
     """The mesh in a slice through the lowest point of the bone, coloured by tissue."""
-    figure, (panel,) = chart()
-    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate.axes))
-    for (name, members), colour in zip(mesh.regions.items(), cycle(REGION_COLOURS), strict=False):
+    point = _lowest_bone_point(mesh, plate.axes)
+    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, point)
+    figure, (panel,), _ = _slice_panels(["Unloaded"], corners, plate.axes)
+    look = looks(mesh.regions, TISSUES)
+    for name, members in mesh.regions.items():
         mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]
-        panel.add_collection(PolyCollection(mine, facecolors=colour, edgecolors="white", linewidths=0.3, label=name))
-    panel.autoscale_view()
-    panel.set_aspect("equal")
-    label_axes(panel, "along the shear, mm", "along the normal force, mm")
-    panel.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        how: dict[str, Any] = {"facecolors": look[name].colour, "edgecolors": "white", "linewidths": 0.3}
+        panel.add_collection(PolyCollection(mine, label=name, rasterized=True, **how), autolim=False)
+    legend(panel, loc="upper left")
     return figure
 
 
-def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> Figure:
-    """Quantities over the cell size (cube root of the mean cell volume), each divided by its extrapolated limit.
+def convergence(sizes_mm: Sequence[float], curves: Mapping[tuple[str, str], tuple[Sequence[float], Limit]]) -> Figure:
+    """Quantities of each load over the cell size (cube root of the mean cell volume), divided by their limits.
 
-    The grey line is 1.
+    The grey line is 1. Dots lead to the limit by the order of convergence.
     """
-    figure, (axes,) = chart()
-    for (name, (values, limit)), colour in zip(curves.items(), cycle(REGION_COLOURS), strict=False):
-        style = "-" if "travel" in name else "--"
-        axes.plot(sizes_mm, np.array(values) / limit.limit, style, marker="o", color=colour, linewidth=1.6, label=name)
+    figure, (axes,) = chart(page_wide=True)
+    of_loads, kinds = looks(load for load, _ in curves), list(dict.fromkeys(kind for _, kind in curves))
+    for (load, kind), (values, limit) in curves.items():
+        colour, number = of_loads[load].colour, kinds.index(kind)
+        how = Look.numbered(6 * number).line | {"color": colour, "marker": Look.numbered(number).marker}
+        axes.plot(sizes_mm, np.array(values) / limit.limit, label=f"{load}, {kind}", markersize=5, **how)
         h = np.linspace(0.0, min(sizes_mm), _POINTS)
         slope = (values[int(np.argmin(sizes_mm))] - limit.limit) / min(sizes_mm) ** limit.order
         axes.plot(h, 1.0 + slope * h**limit.order / limit.limit, ":", color=colour, linewidth=1.2)
-    axes.axhline(1.0, color="#9aa5b1", linewidth=1.0)
+    axes.axhline(1.0, color=RULE, linewidth=1.0)
     axes.set_xlim(0.0, 1.05 * max(sizes_mm))
     label_axes(axes, "cell size, mm", "value / extrapolated limit")
-    axes.legend(fontsize=8, frameon=False)
+    legend(axes, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

@@ -200,8 +200,8 @@ class Simulation:
         return sagittal_slice(self.mesh, self.states if loads is None else [self.state(name) for name in loads])
 
     def _repr_html_(self) -> str:
+        from dvc.report.drawing import png_bytes
         from dvc.report.page import Picture, Table, notebook_html
-        from dvc.report.sheet import png_bytes
 
         rows: list[tuple[str | float, ...]] = []
         for state in self.states:
@@ -259,6 +259,7 @@ class Simulation:
         OutputError
             If it cannot be written.
         """
+        from dvc.report.drawing import save_figure
         from fe import figures
 
         place = Path(folder)
@@ -272,8 +273,8 @@ class Simulation:
         parameters = {"fixed": list(self.fixed), "turns": self.turns} | self.parameters()
         content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
         write_json(place / RECORD, content | dict(record or {"parameters": parameters}))
-        figures.write_figure(place / "slices.png", self.plot())
-        figures.write_figure(place / "force_travel.png", figures.force_displacement(self.states))
+        save_figure(place / "slices", self.plot())
+        save_figure(place / "force_travel", figures.force_displacement(self.states))
 
     def write_decks(self, folder: Path | str) -> None:
         """Write input files of each load with quadratic tetrahedra: ``LOAD.inp`` (CalculiX), ``LOAD.feb`` (FEBio 4).

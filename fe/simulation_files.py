@@ -27,7 +27,7 @@ from fe.solution import LoadState
 
 RECORD = "simulation.json"
 ENDING = ".restart.npz"
-_TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
+_TABLES = ("regions.csv", "curve.csv", "slices.png", "slices.pdf", "force_travel.png", "force_travel.pdf")
 _CONTACT = [field.name for field in fields(ContactStatus)]
 _PLATE = [field.name for field in fields(PlateState)]
 

@@ -14,8 +14,8 @@ from dvc import LabelMap, TetMesh, Verdict
 from dvc.arguments import checked
 from dvc.atomic_files import whole_folder, write_json
 from dvc.errors import InputError
+from dvc.report.drawing import png_bytes
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
-from dvc.report.sheet import png_bytes
 from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, tables
@@ -27,7 +27,7 @@ from validate.location import Overlap
 from validate.mapping import ALL
 from validate.misfit import check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
-from validate.report import Drawn, area_rows, closing_sections, draw, load_sections, overview, pictures_of_all, shown
+from validate.report import Drawn, area_rows, closing_sections, draw, drawings_of_all, load_sections, overview, shown
 from validate.strain_by_load import Strip
 from validate.tables import Curve
 
@@ -168,15 +168,14 @@ class Comparison:
         target.mkdir(parents=True, exist_ok=True)
         tables.remove_earlier(target, list(self.coverage_ml))
         about = dict(record) if record is not None else {"parameters": {"strains": list(self.strains)}}
-        colours = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
+        models = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
         notes = [note for note in self.notes if note not in _doubts(self.verdict)]
-        drawn = partial(draw, colours=colours, image=self.loads[0].case.image)
+        drawn = partial(draw, models=models, image=self.loads[0].case.image)
         write_one = partial(_write_load, folder=target, drawn=drawn, about=about, on_image=on_image)
         parts, strips = zip(*each(write_one, self.loads), strict=True)
-        of_all = pictures_of_all(strips, self.curves, self.strains, self.ranking)
-        for stem, picture in of_all.items():
-            (target / f"{stem}.png").write_bytes(picture.png)
-        first = overview(self.loads, self.ranking, self.warnings, notes, [*of_all.values()])
+        of_all = drawings_of_all(strips, self.curves, self.strains, self.ranking)
+        pictures = [drawing.save(target / stem) for stem, drawing in of_all.items()]
+        first = overview(self.loads, self.ranking, self.warnings, notes, pictures)
         sections = [first, *(section for part in parts for section in part)]
         known = {load: of for load, of in self.verdicts.items() if of is not None}
         levels = {load: of.level for load, of in known.items()}
@@ -225,11 +224,10 @@ def _write_load(
     one: LoadComparison, folder: Path, drawn: Callable[..., Drawn], about: Mapping[str, object], on_image: bool
 ) -> tuple[list[Section], Strip]:
     """Write the folder of one load; return its sections of the report, and its part of the first figure."""
-    pictures, viewer, strip = drawn(one)
+    drawings, viewer, strip = drawn(one)
     with whole_folder(folder / one.load) as part:
         tables.write_fields(part / "fields.vtu", one)
-        for stem, picture in pictures.items():
-            (part / f"{stem}.png").write_bytes(picture.png)
+        pictures = {stem: drawing.save(part / stem) for stem, drawing in drawings.items()}
         if on_image:
             tables.write_on_image(part, one)
         write_json(part / "provenance.json", {**about, "verdict": _plain(one.case.verdict)})

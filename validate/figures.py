@@ -1,58 +1,73 @@
-"""Figures of a comparison: PNG bytes, with the docstring as caption, and matplotlib figures for interactive use."""
+"""Figures of a comparison; the docstring of each is its caption."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from dvc import Deformation
 from dvc.arrays import FloatArray
-from dvc.report.figures import REGION_COLOURS
-from dvc.report.sheet import INK, WIDTH_IN, chart, label_axes, panels, png_bytes
+from dvc.report.chart import chart, label_axes, legend, panels, shared_bar
+from dvc.report.drawing import Columns
+from dvc.report.style import BAND, INK, RULE, WIDTH_IN, Look, looks
+from fe import published_names
 from fe.figures import Slice, slice_sheet
 from validate.curves import Area
+from validate.extrapolation import LEVELLED
 from validate.load_comparison import LoadComparison
 from validate.mapping import ALL, MappedFields, filled_from_nearest
 from validate.tables import LOWER, UPPER, Curve, curves_of
 
-_POINTS, _COLUMNS, _BINS, _BAND = 601, 3, 60, "#b8bfc9"
+_POINTS, _COLUMNS, _BINS, _NAMED = 601, 3, 60, 16
+_MAX_SHEAR = "maximum shear strain, no unit"
 
 
-def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence[str]) -> bytes:
+def model_looks(models: Iterable[str]) -> dict[str, Look]:
+    """A look for each model: the published sets have theirs in every figure; a levelled model is dotted."""
+    names = list(models)
+    sets = [name for name in published_names() if not name.endswith("-as-published")]
+    plain = looks((name.removesuffix(LEVELLED) for name in names), sets)
+    own = {name: plain[name.removesuffix(LEVELLED)] for name in names}
+    return {name: look.dotted if name.endswith(LEVELLED) else look for name, look in own.items()}
+
+
+def volume_strain(one: LoadComparison, tissues: Sequence[str], models: Sequence[str]) -> Figure:
     """Volume of tissue in which the maximum shear strain exceeds a value: measured (black) and models, same cells.
 
     The grey band contains the true curve in 95 % of cases, according to the error model of the measurement. Areas are
     computed between the dotted lines.
     """
     curves = curves_of(one, np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS))
-    return png_bytes(_curves([c for c in curves if c.tissue in tissues], "tissue", one.criteria.strains, colours))
+    return _curves([c for c in curves if c.tissue in tissues], "tissue", one.criteria.strains, models)
 
 
-def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], colours: Sequence[str]) -> Figure:
+def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], models: Sequence[str]) -> Figure:
     """Curves, one panel for each load or tissue."""
     by_panel: dict[str, dict[str, Curve]] = {}
     for curve in curves:
         by_panel.setdefault(getattr(curve, by), {})[curve.field] = curve
     figure, spots = panels(len(by_panel))
+    look = model_looks(models)
     for axes, (title, of) in zip(spots, by_panel.items(), strict=True):
         at = of["measured"].max_shear
         if LOWER in of:
             edges = of[LOWER].volume_above_ml, of[UPPER].volume_above_ml
-            axes.fill_between(at, *edges, color=_BAND, linewidth=0, label="95 % band of the true curve")
-        for name in (name for name in ("measured", *colours) if name in of):
-            colour, width = ("black", 2.2) if name == "measured" else (_colour(colours.index(name)), 1.5)
-            axes.plot(at, of[name].volume_above_ml, color=colour, linewidth=width, label=name)
+            axes.fill_between(at, *edges, color=BAND, linewidth=0, label="95 % band of the true curve")
+        for name in (name for name in ("measured", *models) if name in of):
+            how = {"color": "black", "linewidth": 2.4} if name == "measured" else look[name].line
+            axes.plot(at, of[name].volume_above_ml, label=name, **how)
         for edge in strains:
-            axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
+            axes.axvline(edge, color=RULE, linewidth=0.9, linestyle=":")
         axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
-        label_axes(axes, "maximum shear strain", "volume above this strain, mL", title)
-    spots[0].legend(fontsize=9, frameon=False)
+        label_axes(axes, _MAX_SHEAR, "volume above this strain, mL", title)
+    legend(spots[0])
     return figure
-
-
-def _colour(number: int) -> str:
-    return REGION_COLOURS[number % (len(REGION_COLOURS) - 1)]
 
 
 def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Figure:
@@ -64,46 +79,32 @@ def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Fig
     return _curves(curves, "load", strains, models)
 
 
-def all_loads(curves: Sequence[Curve], strains: tuple[float, float]) -> bytes:
-    """Volume of tissue in which the maximum shear strain exceeds a value, for each load: measured (black), simulated.
-
-    The grey band contains the true curve in 95 % of cases. Areas are computed between the dotted lines.
-    """
-    return png_bytes(curves_by_load(curves, strains))
-
-
 def areas_by_load(areas: Sequence[Area]) -> Figure:
     """Area between strain-volume curves by load and model: estimate with 95 % interval, or as measured if unknown."""
     models, loads = (list(dict.fromkeys(getattr(a, of) for a in areas)) for of in ("model", "load"))
     figure, (axes,) = chart()
-    width = 0.6 / len(models)
+    look, width = model_looks(models), 0.6 / len(models)
     for number, model in enumerate(models):
         rows = [a for a in areas if a.model == model]
         at = [loads.index(a.load) + (number - 0.5 * (len(models) - 1)) * width for a in rows]
-        axes.plot(at, [a.best_ml for a in rows], "o", color=_colour(number), label=model)
-        axes.vlines(at, [a.low_ml for a in rows], [a.high_ml for a in rows], color=_colour(number), linewidth=1.8)
+        of = look[model]
+        axes.plot(at, [a.best_ml for a in rows], **of.marked | {"linestyle": "none", "label": model})
+        axes.vlines(at, [a.low_ml for a in rows], [a.high_ml for a in rows], color=of.colour, linewidth=1.8)
     axes.set_xticks(range(len(loads)), loads)
     axes.set(xlim=(-0.5, len(loads) - 0.5), ylim=(0.0, None))
     label_axes(axes, "", "area between strain-volume curves, mL")
-    axes.legend(fontsize=9, frameon=False)
+    legend(axes)
     return figure
 
 
-def _by_model(count: int) -> tuple[Figure, list[Axes]]:
-    """Square panels."""
-    columns = min(count, _COLUMNS)
-    width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
-    return panels(count, columns, (width, width / columns))
-
-
-def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray) -> bytes:
+def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray) -> Figure:
     """Maximum shear strain in a slice, measured and simulated, on the deformed tissue.
 
     The slice contains the plate's normal and the direction of shear. All panels show the same cells with one colour
     scale; grey is undefined. Nodes outside the measurement are drawn with the displacement of the nearest node inside.
     Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    return png_bytes(slice_sheet(one.fields.mesh, slice_panels(one.fields, measured, u_mm), one.case.axes, point_mm))
+    return slice_sheet(one.fields.mesh, slice_panels(one.fields, measured, u_mm), one.case.axes, point_mm)
 
 
 def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str, FloatArray]) -> list[Slice]:
@@ -113,61 +114,122 @@ def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str,
     return [measured_panel] + [Slice(name, u_mm[name], field.max_shear) for name, field in fields.models.items()]
 
 
-def scatter(fields: MappedFields) -> bytes:
+@dataclass(frozen=True, slots=True, eq=False)
+class Bins:
+    """Volume of tissue, mL (x, y), by two figures of a cell, in squares of equal size."""
+
+    x: FloatArray  # edges
+    y: FloatArray
+    volume_ml: FloatArray
+
+    @classmethod
+    def of(
+        cls, x: FloatArray, y: FloatArray, volumes_ml: FloatArray, reach: tuple[tuple[float, float], ...] | None = None
+    ) -> Self:
+        """Cells (n,) in their squares, over all or within a range of each figure."""
+        volume, edges, up = np.histogram2d(x, y, bins=_BINS, range=reach, weights=volumes_ml)
+        return cls(edges, up, volume)
+
+    def columns(self, x: str, y: str) -> dict[str, list[float]]:
+        """The middle of each square that holds any tissue, by the names of the figures, and its volume."""
+        i, j = np.nonzero(self.volume_ml)
+        middles = (0.5 * (edges[1:] + edges[:-1]) for edges in (self.x, self.y))
+        named = {name: of[at].tolist() for name, of, at in zip((x, y), middles, (i, j), strict=True)}
+        return named | {"volume_ml": self.volume_ml[i, j].tolist()}
+
+
+def agreement_bins(fields: MappedFields) -> dict[str, Bins]:
+    """Measured and simulated maximum shear strain by model."""
+    where = fields.common
+    x, volumes = fields.measured.max_shear[where], fields.volumes_ml[where]
+    most = max(0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in fields.by_name.values()))
+    reach = ((0.0, most), (0.0, most))
+    return {name: Bins.of(x, field.max_shear[where], volumes, reach) for name, field in fields.models.items()}
+
+
+def difference_bins(fields: MappedFields, quantity: str) -> dict[str, Bins]:
+    """Mean and difference of simulated and measured strain, or of the length of the displacement, by model."""
+    where, made = fields.common, dict[str, Bins]()
+    for name, field in fields.models.items():
+        x, y = (
+            of.max_shear[where] if quantity == "max_shear" else np.linalg.norm(of.u_mm[where], axis=1)
+            for of in (fields.measured, field)
+        )
+        made[name] = Bins.of(0.5 * (x + y), y - x, fields.volumes_ml[where])
+    return made
+
+
+def columns_of(bins: Mapping[str, Bins], x: str, y: str) -> Columns:
+    """The squares of all models one below the other."""
+    each = {name: of.columns(x, y) for name, of in bins.items()}
+    models = [name for name, columns in each.items() for _ in columns["volume_ml"]]
+    joined = {key: [value for columns in each.values() for value in columns[key]] for key in (x, y, "volume_ml")}
+    return {"model": models, **joined}
+
+
+def scatter(bins: Mapping[str, Bins]) -> Figure:
     """Simulated over measured maximum shear strain, cell by cell; darker is more volume (logarithmic).
 
     On the line, both are equal.
     """
-    figure, spots = _by_model(len(fields.models))
-    where = fields.common
-    x, volumes = fields.measured.max_shear[where], fields.volumes_ml[where]
-    most = max(0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in fields.by_name.values()))
-    for spot, (name, field) in zip(spots, fields.models.items(), strict=True):
-        y, ranges = field.max_shear[where], ((0.0, most), (0.0, most))
-        spot.hist2d(x, y, bins=_BINS, range=ranges, weights=volumes, norm="log", cmap="Blues")
-        spot.plot([0.0, most], [0.0, most], color=INK, linewidth=0.9)
+    figure, spots = _binned(bins)
+    for spot, (name, of) in zip(spots, bins.items(), strict=True):
+        spot.plot([0.0, of.x[-1]], [0.0, of.x[-1]], color=INK, linewidth=0.9)
         spot.set_aspect("equal")
-        label_axes(spot, "measured", "simulated", name)
-    return png_bytes(figure)
+        label_axes(spot, "measured max. shear, no unit", "simulated max. shear, no unit", name)
+    return figure
 
 
-def differences(one: LoadComparison, quantity: str) -> bytes:
+def differences(bins: Mapping[str, Bins], one: LoadComparison, quantity: str) -> Figure:
     """Bland-Altman plot: simulated minus measured over the mean of both, cell by cell; darker is more volume.
 
     The solid line is the mean difference, dashed lines are the limits of agreement, 1.96 standard deviations away.
     """
-    fields, where, unit = one.fields, one.fields.common, "" if quantity == "max_shear" else ", mm"
-    limits = [row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)]
-    figure, spots = _by_model(max(1, len(limits)))
-    for spot, row in zip(spots, limits, strict=False):
-        x, y = (
-            field.max_shear[where] if quantity == "max_shear" else np.linalg.norm(field.u_mm[where], axis=1)
-            for field in (fields.measured, fields.models[row.model])
+    limits = {row.model: row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)}
+    unit, what = ("no unit", "max. shear") if quantity == "max_shear" else ("mm", "displacement")
+    figure, spots = _binned(bins)
+    for spot, name in zip(spots, bins, strict=True):
+        if name in limits:
+            row = limits[name]
+            for height, style in ((row.bias, "-"), (row.lower, "--"), (row.upper, "--")):
+                spot.axhline(height, color=INK, linewidth=0.9, linestyle=style)
+        label_axes(spot, f"mean {what}, {unit}", f"simulated − measured, {unit}", name)
+    return figure
+
+
+def _binned(bins: Mapping[str, Bins]) -> tuple[Figure, list[Axes]]:
+    """A square panel for each model, all in the colours of one scale of volume."""
+    columns = min(len(bins), _COLUMNS)
+    width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
+    figure, spots = panels(len(bins), columns, (width, width / columns))
+    volumes = np.concatenate([of.volume_ml[of.volume_ml > 0.0] for of in bins.values()])
+    norm, shades = LogNorm(volumes.min(), volumes.max()), colormaps["cividis_r"]
+    for spot, of in zip(spots, bins.values(), strict=True):
+        shown = np.ma.masked_equal(of.volume_ml.T, 0.0)
+        extent = (of.x[0], of.x[-1], of.y[0], of.y[-1])
+        spot.imshow(
+            shown, cmap=shades, norm=norm, origin="lower", extent=extent, aspect="auto", interpolation="nearest"
         )
-        spot.hist2d(0.5 * (x + y), y - x, bins=_BINS, weights=fields.volumes_ml[where], norm="log", cmap="Blues")
-        for height, style in ((row.bias, "-"), (row.lower, "--"), (row.upper, "--")):
-            spot.axhline(height, color=INK, linewidth=0.9, linestyle=style)
-        label_axes(spot, f"mean of both{unit}", f"simulated - measured{unit}", row.model)
-    return png_bytes(figure)
+    shared_bar(spots, ScalarMappable(norm, shades), "volume in a square, mL")
+    return figure, spots
 
 
-def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> bytes:
+def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> Figure:
     """Normalised area between strain-volume curves of each subject (points) by model; the bar is the mean.
 
     Lines connect the models of one subject.
     """
-    figure, (axes,) = chart()
+    figure, (axes,) = chart(page_wide=True)
     subjects = list(dict.fromkeys(s for model in models for s in shares[model]))
-    for number, subject in enumerate(subjects):
+    for subject, look in looks(subjects).items():
         points = [(at, 100.0 * shares[m][subject]) for at, m in enumerate(models) if subject in shares[m]]
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
-        axes.plot(*zip(*points, strict=True), "o-", color=colour, linewidth=0.8, markersize=4, label=subject)
+        axes.plot(*zip(*points, strict=True), label=subject, **look.marked | {"linewidth": 0.8, "markersize": 4})
     for at, model in enumerate(models):
         mean = 100.0 * float(np.mean(list(shares[model].values())))
         axes.plot([at - 0.25, at + 0.25], [mean, mean], color=INK, linewidth=2.5)
     axes.set_xticks(range(len(models)), list(models), rotation=30, ha="right")
     axes.set_ylim(bottom=0.0)
     label_axes(axes, "", "normalised area, %")
-    if len(subjects) <= len(REGION_COLOURS):
-        axes.legend(fontsize=8, frameon=False)
-    return png_bytes(figure)
+    if len(subjects) <= _NAMED:
+        legend(axes, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure

@@ -9,6 +9,7 @@ import numpy as np
 from dvc import Deformation, LabelMap, Mask, StrainField, Verdict, evaluate_on_grid
 from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
+from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from validate import figures
 from validate.agreement import Agreement, SkinDisplacement
@@ -22,6 +23,10 @@ from validate.strain_by_load import MEASURED, Strip, strain_by_load
 from validate.tables import Curve
 
 _AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
+_DIFFERENCES = (  # stem of the files, quantity, its name with its unit in the columns, title
+    ("differences_shear", "max_shear", "max_shear", "Differences of maximum shear strain"),
+    ("differences_u", "u_mm", "displacement_mm", "Differences of displacement magnitude"),
+)
 _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
 _CLOSING = Section(
     "How to read this",
@@ -49,12 +54,12 @@ _CLOSING = Section(
 )  # fmt: skip
 
 
-Drawn = tuple[dict[str, Picture], Viewer, Strip]
+Drawn = tuple[dict[str, Drawing], Viewer, Strip]
 """Figures of a load, by the stem of their files, its viewer, and its part of the first figure of the report."""
 
 
-def draw(one: LoadComparison, colours: Sequence[str], image: Path | None) -> Drawn:
-    """Draw a load; ``colours`` lists all models in the order of colours, ``image`` is the anatomy in all viewers."""
+def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Drawn:
+    """Draw a load; ``models`` are those of all loads, ``image`` is the anatomy in all viewers."""
     measured, results = one.case.read()
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
@@ -66,16 +71,21 @@ def draw(one: LoadComparison, colours: Sequence[str], image: Path | None) -> Dra
         point = fields.mesh.bounds_mm.mean(axis=0)
         through = f"The slice goes through the middle of the mesh, since the lowest point of {bone} is outside of it."
     slices = one, measured, displacements, point
-    shear, u = ((figures.differences, one, quantity) for quantity in ("max_shear", "u_mm"))
-    pictures = {
-        "curves": Picture.drawn("Strain-volume curves", figures.volume_strain, one, tissues[:_PANELS], colours),
-        "slices": Picture.drawn("Location of the strain", figures.slices, *slices, note=through),
-        "agreement": Picture.drawn("Maximum shear strain, cell by cell", figures.scatter, fields),
-        "differences_shear": Picture.drawn("Differences of maximum shear strain", *shear),
-        "differences_u": Picture.drawn("Differences of displacement magnitude", *u),
-    }
+    agreement = figures.agreement_bins(fields)
+    drawings = {
+        "curves": Drawing.of("Strain-volume curves", figures.volume_strain, one, tissues[:_PANELS], models),
+        "slices": Drawing.of("Location of the strain", figures.slices, *slices, note=through),
+        "agreement": Drawing.of(
+            "Maximum shear strain, cell by cell", figures.scatter, agreement,
+            data=figures.columns_of(agreement, "measured_max_shear", "simulated_max_shear"),
+        ),
+    }  # fmt: skip
+    for stem, quantity, name, title in _DIFFERENCES:
+        bins = figures.difference_bins(fields, quantity)
+        data = figures.columns_of(bins, f"mean_{name}", f"difference_{name}")
+        drawings[stem] = Drawing.of(title, figures.differences, bins, one, quantity, data=data)
     lowest = lowest_bone_point(one.labels, bone, axes)
-    return pictures, _viewer(one, measured, results, image), Strip.of(one, measured, results, lowest)
+    return drawings, _viewer(one, measured, results, image), Strip.of(one, measured, results, lowest)
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
@@ -136,9 +146,9 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     ]
 
 
-def pictures_of_all(
+def drawings_of_all(
     strips: Sequence[Strip], curves: Sequence[Curve], strains: tuple[float, float], ranking: Ranking
-) -> dict[str, Picture]:
+) -> dict[str, Drawing]:
     """The first figures of a report, by the stem of their files: slices and curves under all loads."""
     model = ranking.areas[0].model if ranking.areas else next(n for n in strips[0].max_shear if n != MEASURED)
     pages = [strip.max_shear[name] for strip in strips for name in (MEASURED, model) if name in strip.max_shear]
@@ -148,8 +158,8 @@ def pictures_of_all(
     note = f"Lower row: {model}, {best}. {strips[0].title}, through the lowest point of the bone."
     slices, of_all = (strips, model, highest), [curve for curve in curves if curve.tissue == ALL]
     return {
-        "slices_by_load": Picture.drawn("Measured and simulated strain", strain_by_load, *slices, note=note),
-        "curves_by_load": Picture.drawn("Strain-volume curves, all soft tissue", figures.all_loads, of_all, strains),
+        "slices_by_load": Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note),
+        "curves_by_load": Drawing.of("Strain-volume curves, all soft tissue", figures.curves_by_load, of_all, strains),
     }
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -17,23 +16,22 @@ from dvc import Deformation, StrainField, evaluate_on_grid
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.images.image import reordered_to_lps
 from dvc.io.images.read import read_voxels
+from dvc.report.chart import colour_bar, empty
+from dvc.report.figures import MAX_SHEAR
 from dvc.report.sheet import (
     AXES,
-    DPI,
-    FONT,
-    INK,
     LETTERS,
     PLANES,
-    SHADOW,
-    WIDTH_IN,
     Plane,
     View,
     levelled,
+    name_sides,
     outline,
-    png_bytes,
     scale_bar,
+    slice_panel,
     window_of,
 )
+from dvc.report.style import FONT, INK, ON_DARK, WIDTH_IN
 from validate.fe_result import FeResult
 from validate.load_comparison import LoadComparison
 
@@ -90,7 +88,7 @@ def _in_slice(view: View, plane: Plane) -> BoolArray:
     return inside
 
 
-def strain_by_load(strips: Sequence[Strip], model: str, highest: float) -> bytes:
+def strain_by_load(strips: Sequence[Strip], model: str, highest: float) -> Figure:
     """Maximum shear strain in one slice of the unloaded anatomy under each load: measured (top) and a model (bottom).
 
     White lines are the surfaces of the body and of the bones. The image is grey where strain is not defined.
@@ -101,25 +99,23 @@ def strain_by_load(strips: Sequence[Strip], model: str, highest: float) -> bytes
     inches = min((WIDTH_IN - _SIDE_IN) / len(strips) / width_mm - _GAP_IN / width_mm, _TALLEST_IN / height_mm)
     w, h = inches * width_mm, inches * height_mm
     size = _SIDE_IN + len(strips) * (w + _GAP_IN), _HEAD_IN + 2 * (h + _GAP_IN) + _FOOT_IN
-    figure, norm = Figure(figsize=size, dpi=DPI, facecolor="white"), Normalize(0.0, highest)
-    FigureCanvasAgg(figure)
+    figure, norm = empty(size), Normalize(0.0, highest)
     for row, name in enumerate((MEASURED, model)):
         low = _FOOT_IN + (1 - row) * (h + _GAP_IN)
         figure.text(0.12 / size[0], (low + h / 2) / size[1], name, rotation=90, va="center", color=INK, **FONT)
         for column, strip in enumerate(strips):
             box = (_SIDE_IN + column * (w + _GAP_IN)) / size[0], low / size[1], w / size[0], h / size[1]
-            axes = figure.add_axes(box, xticks=[], yticks=[], facecolor="black")
+            axes = slice_panel(figure, box)
             _paint(axes, strip, name, norm)
             if row == 0:
                 axes.set_title(strip.load, color=INK, pad=4, **FONT)
+            name_sides(axes, LETTERS[strip.plane], **ON_DARK)
             if row == column == 0:
-                _mark(axes, strip)
+                scale_bar(axes, width_mm, **ON_DARK)
     length = min(4.2, 0.6 * size[0])
     bar = figure.add_axes(((size[0] - length) / 2 / size[0], 0.42 / size[1], length / size[0], 0.12 / size[1]))
-    figure.colorbar(ScalarMappable(norm, _COLOURS), cax=bar, orientation="horizontal", extend="max")
-    bar.set_xlabel("maximum shear strain (E₁ − E₃)/2", color=INK, labelpad=2, **FONT)
-    bar.tick_params(labelsize=9, length=3, pad=2)
-    return png_bytes(figure)
+    colour_bar(bar, ScalarMappable(norm, _COLOURS), MAX_SHEAR, "max")
+    return figure
 
 
 def _paint(axes: Axes, strip: Strip, name: str, norm: Normalize) -> None:
@@ -127,16 +123,7 @@ def _paint(axes: Axes, strip: Strip, name: str, norm: Normalize) -> None:
     axes.imshow(strip.image, cmap="gray", vmin=0.0, vmax=1.0, **how)
     values: npt.NDArray[Any] | None = strip.max_shear.get(name)
     if values is None:
-        axes.text(0.5, 0.5, "no result", transform=axes.transAxes, ha="center", color="white", path_effects=SHADOW)
+        axes.text(0.5, 0.5, "no result", transform=axes.transAxes, ha="center", **ON_DARK, **FONT)
     else:
         axes.imshow(np.ma.masked_invalid(values), cmap=_COLOURS, norm=norm, interpolation="nearest", **how)
     outline(axes, strip.extent_mm, strip.outlines)
-
-
-def _mark(axes: Axes, strip: Strip) -> None:
-    """Letters for the sides of the body, and a scale bar."""
-    white: dict[str, Any] = {"color": "white", "path_effects": SHADOW, "transform": axes.transAxes}
-    spots = (0.015, 0.5, "left", "center"), (0.985, 0.5, "right", "center"), (0.5, 0.985, "center", "top")
-    for letter, (x, y, ha, va) in zip(LETTERS[strip.plane], (*spots, (0.5, 0.015, "center", "bottom")), strict=True):
-        axes.text(x, y, letter, ha=ha, va=va, weight="bold", **white, **FONT)
-    scale_bar(axes, strip.extent_mm[1] - strip.extent_mm[0])

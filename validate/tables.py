@@ -15,6 +15,7 @@ from dvc import Image, StrainField, evaluate_on_grid, write_image, write_vectors
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_csv
 from dvc.errors import InputError
+from dvc.report.drawing import figure_files
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
 from validate.load_comparison import LoadComparison
@@ -24,6 +25,8 @@ from validate.mapping import ALL
 RECORD = "comparison.json"
 TABLES = {"areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement}
 CURVES = "curves.csv"
+OF_ALL_LOADS = ("slices_by_load", "curves_by_load")
+"""Stems of the figures under all loads."""
 LOWER, UPPER = "measured, low", "measured, high"
 """Names of the curves that bound the 95 % band of the true curve."""
 _CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml", "verdict")
@@ -114,8 +117,9 @@ def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
         earlier = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["coverage_ml"])
     except (OSError, ValueError, KeyError, TypeError):
         return
-    for name in (*TABLES, CURVES, RECORD, "report.html", "slices_by_load.png", "curves_by_load.png"):
-        (folder / name).unlink(missing_ok=True)
+    pictures = (path for stem in OF_ALL_LOADS for path in figure_files(folder / stem))
+    for path in (*(folder / name for name in (*TABLES, CURVES, RECORD, "report.html")), *pictures):
+        path.unlink(missing_ok=True)
     for load in earlier:
         if load not in loads and (folder / load / "fields.vtu").is_file():
             shutil.rmtree(folder / load)

@@ -23,9 +23,10 @@ from dvc.measurement.judgement import Evidence, Source
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
+from dvc.report.drawing import Drawing, png_bytes
 from dvc.report.figures import Scale, coloured
 from dvc.report.page import Picture, Section, notebook_html
-from dvc.report.sheet import PLANES, Plane, View, png_bytes
+from dvc.report.sheet import PLANES, Plane, View
 from dvc.trust.assessment import assess
 from dvc.trust.error_model import Interval
 from dvc.trust.quality import Quality, noise_floor
@@ -310,9 +311,9 @@ class Measurement:
             self.name, self.verdict, tuple(tables), (*first, *others), pictures_first=True, summary=short
         )  # fmt: skip
 
-    def pictures(self) -> dict[str, Picture]:
-        """The figures of a report, by the name of their file; InputError for one that was read from a folder."""
-        return page.pictures_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
+    def drawings(self) -> dict[str, Drawing]:
+        """The figures of a report, by the name of their files; InputError for one that was read from a folder."""
+        return page.drawings_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
 
     def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
         """Write everything to a folder, complete or not at all; an older folder of that name is replaced.
@@ -354,7 +355,9 @@ class Measurement:
                 writing.append(pool.submit(files.write_uncertainty, partial, grid, sure, bars.model, verdict))
             if (mesh := made.subject.mesh) is not None:  # in the same thread, as compiled kernels may not be in two
                 onto = pool.submit(files.write_mesh_results, partial, mesh, self.deformation, verdict)
-            pictures = self.pictures()  # while files are compressed
+            place = partial / files.FIGURES
+            place.mkdir()
+            pictures = {stem: one.save(place / stem) for stem, one in self.drawings().items()}  # while files are made
             write_regions_csv(partial / files.REGIONS, self.regions, verdict)
             for one in writing:
                 one.result()
@@ -363,9 +366,6 @@ class Measurement:
             write_json(partial / files.QUALITY, told)
             if provenance is not None:
                 write_json(partial / files.PROVENANCE, provenance)
-            (partial / files.FIGURES).mkdir()
-            for stem, picture in pictures.items():
-                (partial / files.FIGURES / f"{stem}.png").write_bytes(picture.png)
         return self.section(pictures)
 
     def _made_from(self) -> Source:

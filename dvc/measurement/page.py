@@ -1,4 +1,4 @@
-"""Pictures and tables of a measurement in a report."""
+"""Figures and tables of a measurement in a report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -8,12 +8,13 @@ import numpy as np
 
 from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import StrainMaps
-from dvc.images.image import Image
+from dvc.images.image import Image, LabelMap
 from dvc.measurement.error_bars import ErrorBars
 from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
-from dvc.report.page import Cell, Picture, Table, shown
+from dvc.report.drawing import Columns, Drawing
+from dvc.report.page import Cell, Table, shown
 from dvc.report.sheet import View
 from dvc.trust.error_model import Interval
 from dvc.trust.quality import NoiseFloor, Quality
@@ -33,38 +34,46 @@ _TWIN = (
 )
 
 
-def pictures_of(
+def drawings_of(
     view: View, made: Source, maps: StrainMaps, floor: NoiseFloor | None, sigma: Float32Array | None
-) -> dict[str, Picture]:
-    """The figures of a report, by the name of their file: agreement of the images, strain, and its uncertainty.
+) -> dict[str, Drawing]:
+    """The figures of a report, by the name of their files: agreement of the images, strain, and its uncertainty.
 
     The deformed grid lies over the loaded image where there is one.
     """
     reference, bone, images = made.subject.reference, made.subject.bone, made.images
-    labels, below, drawn = made.subject.regions(made.tissue), reference.values, dict[str, Picture]()
+    labels, below, drawn = made.subject.regions(made.tissue), reference.values, dict[str, Drawing]()
     if images is not None:
         pair, below = (view, reference, images.aligned, images.registered), images.aligned
         local = view, images.local_rigid, images.local_after
-        drawn["overlay"] = Picture.drawn("Before and after", figures.overlay, *pair)
-        drawn["checkerboard"] = Picture.drawn("Checkerboard", figures.checkerboard, *pair)
-        drawn["similarity"] = Picture.drawn("Local similarity of the images", figures.similarity_slices, *local)
+        drawn["overlay"] = Drawing.of("Before and after", figures.overlay, *pair)
+        drawn["checkerboard"] = Drawing.of("Checkerboard", figures.checkerboard, *pair)
+        drawn["similarity"] = Drawing.of("Local similarity of the images", figures.similarity_slices, *local)
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
     through = "Slices through the lowest point of the bone along the plate normal."
-    picture = Picture.drawn(STRAIN, figures.strain_slices, *strain, note=through)
+    shear = Drawing.of(STRAIN, figures.strain_slices, *strain, note=through)
     if images is not None:
         both = {"unloaded": reference, "loaded, registered": Image(reference.grid, images.registered)}
-        beneath = tuple((name, figures.image_slices(view, image)) for name, image in both.items())
-        picture = replace(picture, beneath=beneath)
-    drawn["strain"] = picture
+        shear = replace(shear, beneath=tuple((name, figures.image_slices(view, image)) for name, image in both.items()))
+    drawn["strain"] = shear
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
-    drawn["curves"] = Picture.drawn("Strain-volume curves", figures.shear_curves, *curves)
+    data = _curve_columns(maps, labels)
+    drawn["curves"] = Drawing.of("Strain-volume curves", figures.shear_curves, *curves, data=data)
     grid = view, below, maps.displacement_mm, None if bone is None else bone.inside
-    drawn["deformed_grid"] = Picture.drawn("Deformed grid", figures.deformed_grid, *grid)
-    drawn["jacobian"] = Picture.drawn("Volume ratio", figures.jacobian_slices, view, reference, maps.jacobian)
+    drawn["deformed_grid"] = Drawing.of("Deformed grid", figures.deformed_grid, *grid)
+    drawn["jacobian"] = Drawing.of("Volume ratio", figures.jacobian_slices, view, reference, maps.jacobian)
     if sigma is not None:
         spread = view, reference, sigma, SIGMA_SCALE
-        drawn["sigma"] = Picture.drawn("Uncertainty of the maximum shear strain", figures.sigma_slices, *spread)
+        drawn["sigma"] = Drawing.of("Uncertainty of the maximum shear strain", figures.sigma_slices, *spread)
     return drawn
+
+
+def _curve_columns(maps: StrainMaps, labels: LabelMap) -> Columns:
+    """The strain-volume curves by region."""
+    curves = figures.strain_volume(maps.max_shear, labels)
+    rows = [(name, *point) for name, curve in curves.items() for point in zip(*curve, strict=True)]
+    names = "region", "max_shear", "volume_above_ml"
+    return {name: [row[number] for row in rows] for number, name in enumerate(names)}
 
 
 def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:

@@ -1,4 +1,4 @@
-"""Figures of a registration, each as PNG bytes: slices in three planes through a point, and curves.
+"""Figures of a registration: slices in three planes through a point, and curves.
 
 All panels of a figure share one scale, so a length is the same everywhere; `dvc.report.sheet` tells how slices lie on
 the page. Yellow marks at a panel's edge show where the other planes cut. Voxels without a value are never drawn as
@@ -7,40 +7,26 @@ zero: the loaded image is dark blue there, a map leaves the image below it plain
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
-from matplotlib.ticker import FormatStrFormatter
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, NullLocator
 from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, LabelMap
-from dvc.report.sheet import (
-    AXES,
-    FONT,
-    INK,
-    PLANES,
-    SHADOW,
-    UNSEEN,
-    Plane,
-    Sheet,
-    Values,
-    View,
-    chart,
-    label_axes,
-    levelled,
-    png_bytes,
-    window_of,
-)
+from dvc.report.chart import chart, label_axes, legend
+from dvc.report.sheet import AXES, PLANES, UNSEEN, Plane, Sheet, Values, View, levelled, window_of
+from dvc.report.style import BAND, BOLD, ON_DARK, TISSUES, looks
 from dvc.trust.regions import volume_above
 
-# The palette of Okabe and Ito, told apart by all common kinds of colour vision.
-REGION_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MAX_SHEAR = "maximum shear strain (E₁ − E₃)/2, no unit"
 SIGMA = "standard deviation of the maximum shear strain, no unit"
 _DISPLACEMENT = "length of the displacement relative to the bone, mm"
@@ -53,9 +39,11 @@ _STAGES = ("After the rigid alignment", "After the whole registration")
 _CHECK_MM = 12.0
 _LINE_MM = 5.0
 _HIGHEST_SHEAR = 0.6
+_DRAWN = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure
+_WRITTEN = np.linspace(0.0, _HIGHEST_SHEAR, 121)
 
 
-def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
+def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> Figure:
     """Unloaded image in green, loaded image in magenta; before and after the non-rigid part of the registration.
 
     Grey: both images agree. A faint tint over a whole region comes from different bias fields. A coloured rim is an
@@ -67,10 +55,10 @@ def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float
         page = np.stack([magenta, green, magenta], axis=-1)
         page[np.isnan(page).any(axis=-1)] = UNSEEN
         sheet.paint(plane, axes, page)
-    return sheet.png()
+    return sheet.finished()
 
 
-def checkerboard(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
+def checkerboard(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> Figure:
     """Squares of 12 mm, alternately from the unloaded and the loaded image; before and after the non-rigid part.
 
     Where the registration is correct, edges continue across the squares without a step.
@@ -83,7 +71,7 @@ def checkerboard(view: View, reference: Image, rigid: Float32Array, registered: 
         page = np.repeat(np.where(odd, b, a)[..., None], 3, axis=-1)
         page[np.isnan(page[..., 0])] = UNSEEN
         sheet.paint(plane, axes, page)
-    return sheet.png()
+    return sheet.finished()
 
 
 def _beside(
@@ -100,28 +88,28 @@ def _beside(
 
 def strain_slices(
     view: View, reference: Image, max_shear: Float32Array, largest: float, outline: LabelMap | None = None
-) -> bytes:
+) -> Figure:
     """Maximum shear strain (E1 - E3)/2 in colour over the unloaded image, in the reference configuration.
 
     Thin white lines are the outlines of the regions. Grey: no result.
     """
-    return coloured(view, reference, max_shear, Scale.of("max_shear", max_shear, largest), outline=outline).png()
+    return coloured(view, reference, max_shear, Scale.of("max_shear", max_shear, largest), outline=outline).finished()
 
 
-def image_slices(view: View, image: Image) -> bytes:
+def image_slices(view: View, image: Image) -> Figure:
     """An MR image in grey, on a page of the size of `strain_slices`."""
     sheet, window = Sheet(view, [""], bar=True), window_of(view, image.values)
     for plane, axes in sheet.rows[0].items():
         sheet.grey(plane, axes, image.values, window)
-    return sheet.png()
+    return sheet.finished()
 
 
-def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
+def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> Figure:
     """Standard deviation of the maximum shear strain in colour over the unloaded image, from the error model.
 
     Grey: bone, or no result.
     """
-    return coloured(view, reference, sigma, Scale.of("sigma", sigma, largest)).png()
+    return coloured(view, reference, sigma, Scale.of("sigma", sigma, largest)).finished()
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +178,7 @@ def coloured(
     return sheet
 
 
-def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> bytes:
+def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> Figure:
     """Volume ratio det F in colour over the unloaded image: purple shrinks, orange expands, white keeps its volume.
 
     Red, with the number of voxels: the deformation folds (det F <= 0). Do not trust any result there.
@@ -203,9 +191,9 @@ def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> byt
             red[folded] = (1.0, 0.0, 0.0, 1.0)
             sheet.paint(plane, axes, red, interpolation="nearest")
             told = f"folded: {np.count_nonzero(folded)} voxels"
-            style: dict[str, Any] = {"color": "#FF8A80", "weight": "bold", "path_effects": SHADOW}
-            axes.text(0.5, 0.08, told, transform=axes.transAxes, ha="center", **style, **FONT)
-    return sheet.png()
+            style = ON_DARK | BOLD | {"color": "#FF8A80", "transform": axes.transAxes}
+            axes.text(0.5, 0.08, told, ha="center", **style)
+    return sheet.finished()
 
 
 def volume_reach(jacobian: Values) -> float:
@@ -214,7 +202,7 @@ def volume_reach(jacobian: Values) -> float:
     return float(np.clip(np.ceil(np.percentile(change, 99.0) * 10) / 10, 0.1, 0.8)) if change.size else 0.1
 
 
-def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array) -> bytes:
+def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array) -> Figure:
     """Local correlation of the loaded with the unloaded image; before and after the non-rigid part.
 
     Yellow: similar. Dark: different, or without structure to compare.
@@ -227,10 +215,10 @@ def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array)
             sheet.paint(plane, axes, page, cmap=shades, norm=norm, interpolation="nearest")
     below = any(bool((view.shown(values) < 0.0).any()) for values in (rigid, registered))
     sheet.bar(shades, norm, "local correlation (1: identical), no unit", "min" if below else "neither")
-    return sheet.png()
+    return sheet.finished()
 
 
-def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Array, bone: BoolArray | None) -> bytes:
+def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Array, bone: BoolArray | None) -> Figure:
     """Material lines over the loaded image, aligned on the bone (orange).
 
     Without load the lines are straight and 5 mm apart. The measured displacement moves them; they should follow the
@@ -247,7 +235,7 @@ def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Arr
         axes.add_collection(LineCollection(lines, colors="#56D4FF", linewidths=1.1), autolim=False)
         if bone is not None:
             sheet.outlines(plane, axes, [view.cut(bone, plane)], "#FFB000")
-    return sheet.png()
+    return sheet.finished()
 
 
 def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[FloatArray]:
@@ -275,35 +263,42 @@ def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[Flo
     return carried
 
 
-def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float | None = None) -> bytes:
+def strain_volume(
+    max_shear: Float32Array, labels: LabelMap, strains: npt.ArrayLike = _WRITTEN
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Strains, and the volume of each region, mL, in which the maximum shear strain exceeds them; exact, without bins.
+
+    A region without any result is left out.
+    """
+    at, voxel_ml = np.asarray(strains, dtype=np.float64), labels.grid.voxel_volume_mm3 / 1000.0
+    values = {name: max_shear[labels.labels == label] for label, name in labels.names.items()}
+    return {name: (at, volume_above(of, voxel_ml, at)) for name, of in values.items() if np.isfinite(of).any()}
+
+
+def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float | None = None) -> Figure:
     """Volume of each region, mL, in which the maximum shear strain exceeds a value: exact step curves, without bins.
 
     Both panels show the same curves; the logarithmic axis resolves the small volumes at high strain. The legend gives
     the fraction of a region without a result; the curve of such a region is a lower bound.
     """
     figure, panels = chart(2, page_wide=True)
-    at = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure; each ordinate is exact
-    voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
-    for number, (label, name) in enumerate(labels.names.items()):
-        values = max_shear[labels.labels == label]
-        if not np.isfinite(values).any():
+    look, curves = looks(labels.names.values(), TISSUES), strain_volume(max_shear, labels, _DRAWN)
+    for label, name in labels.names.items():
+        if name not in curves:
             continue
-        above = volume_above(values, voxel_ml, at)
-        told, undefined = name.replace("$", r"\$"), float(np.isnan(values).mean())  # a dollar would start a formula
-        told += "" if undefined < 0.0005 else f" ({undefined:.1%} without a result)"
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
-        dashes = ("-", "--", ":")[number // len(REGION_COLOURS) % 3]
+        (at, above), missing = curves[name], float(np.isnan(max_shear[labels.labels == label]).mean())
+        told = name.replace("$", r"\$")  # a dollar would start a formula
+        told += "" if missing < 0.0005 else f" ({missing:.1%} without a result)"
         for axes, shown in zip(panels, (above, np.where(above > 0, above, np.nan)), strict=True):
-            axes.step(at, shown, where="post", color=colour, linestyle=dashes, linewidth=1.8, label=told)
+            axes.step(at, shown, where="post", label=told, **look[name].line)
     panels[1].set_yscale("log")
     panels[1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    panels[1].yaxis.set_minor_locator(NullLocator())  # their marks took half the time of the figure
     for axes, scale in zip(panels, ("linear", "logarithmic"), strict=True):
         axes.set_xlim(0.0, _HIGHEST_SHEAR)
-        axes.set_title(f"Strain-volume curve, {scale} axis", loc="left", color=INK, fontsize=10)
-        label_axes(axes, MAX_SHEAR, "volume above this strain, mL")
+        label_axes(axes, MAX_SHEAR, "volume above this strain, mL", f"Strain-volume curve, {scale} axis")
         if noise_floor is not None:
-            axes.axvspan(0.0, noise_floor, color="#9aa5b1", alpha=0.35, linewidth=0, label="below the noise floor")
+            axes.axvspan(0.0, noise_floor, color=BAND, alpha=0.5, linewidth=0, label="below the noise floor")
     panels[0].set_ylim(bottom=0.0)
-    if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(fontsize=9, frameon=False)
-    return png_bytes(figure)
+    legend(panels[0])
+    return figure

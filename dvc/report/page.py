@@ -3,7 +3,7 @@
 import base64
 import gzip
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -56,11 +56,6 @@ class Picture:
     def __post_init__(self) -> None:
         if not self.png.startswith(_PNG_SIGNATURE):
             raise InputError(f"The figure '{self.title}' is not a PNG file; it begins with {self.png[:8]!r}.")
-
-    @classmethod
-    def drawn(cls, title: str, draw: Callable[..., bytes], *shown: object, note: str = "") -> Self:
-        """The figure that ``draw`` makes of ``shown``; its docstring, which says how to read it, is the caption."""
-        return cls(title, " ".join(f"{draw.__doc__ or ''} {note}".split()), draw(*shown))
 
     @property
     def data(self) -> str:

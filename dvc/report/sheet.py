@@ -5,23 +5,24 @@ left of the page), coronal from the front and axial from below (the patient's ri
 grid's axes, never resampled; where those are oblique the titles say so.
 """
 
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib import colormaps, patheffects
+from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import GeometryError
 from dvc.images.image import Grid, Mask, reordered_to_lps
+from dvc.report.chart import colour_bar, empty
+from dvc.report.style import BOLD, FONT, INK, ON_DARK, SMALL, WIDTH_IN
 
 Plane = Literal["sagittal", "coronal", "axial"]
 Values = npt.NDArray[Any]
@@ -33,12 +34,7 @@ LETTERS: dict[Plane, str] = {"sagittal": "APSI", "coronal": "RLSI", "axial": "RL
 OBLIQUE_DEG = 3.0
 _SIDES = ("RL", "AP", "IS")  # of the axes L, P, S: against it and along it
 _LEAST_SHARE = 0.3827  # cosine of 67.5 degrees: half-way between one letter and two
-DPI = 120
-WIDTH_IN = 9.8
-INK = "#1c2733"
 UNSEEN = (0.16, 0.18, 0.30)  # a voxel without a value: neither black, which is dark tissue, nor a colour
-SHADOW = [patheffects.withStroke(linewidth=2.2, foreground="black")]
-FONT: dict[str, Any] = {"family": "DejaVu Sans", "fontsize": 10}
 _GAP_IN, _TITLE_IN, _BAR_IN, _LEAST_WIDTH_IN = 0.10, 0.26, 0.62, 5.2
 _MARK = "#FFD54A"
 
@@ -132,20 +128,19 @@ class Sheet:
         width = max(_LEAST_WIDTH_IN, inches * sum(widths) + gaps)
         strip = _TITLE_IN * (2 if any(titles) else 1)
         height = len(titles) * (inches * max(heights) + strip) + (_BAR_IN if bar else 0.0) + 0.04
-        self.figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
-        FigureCanvasAgg(self.figure)
+        self.figure = empty((width, height))
         self.rows: list[dict[Plane, Axes]] = []
         indent, top = (width - inches * sum(widths) - gaps) / 2, height
         for title in titles:
             if title:
                 at = (indent / width, (top - 0.8 * _TITLE_IN) / height)
-                self.figure.text(*at, title, weight="bold", color=INK, **FONT)
+                self.figure.text(*at, title, color=INK, **FONT)
             left, top = indent, top - strip
             row: dict[Plane, Axes] = {}
             for plane, w, h in zip(planes, widths, heights, strict=True):
                 box = (left / width, (top - h * inches) / height, w * inches / width, h * inches / height)
-                row[plane] = self.figure.add_axes(box, xticks=[], yticks=[], facecolor="black")
-                row[plane].set_title(view.title(plane), loc="left", pad=3, color=INK, fontsize=9.5)
+                row[plane] = slice_panel(self.figure, box)
+                self.figure.text(box[0], box[1] + box[3] + 0.04 / height, view.title(plane), color=INK, **SMALL)
                 left += w * inches + _GAP_IN
             top -= inches * max(heights)
             self.rows.append(row)
@@ -173,14 +168,7 @@ class Sheet:
 
     def bar(self, shades: Colormap, norm: Normalize, label: str, extend: str = "neither") -> None:
         """Draw the one colour bar of the sheet, below the panels."""
-        axes, scale = self.figure.add_axes(self._bar), ScalarMappable(norm, shades)
-        bar = self.figure.colorbar(scale, cax=axes, orientation="horizontal", extend=extend)
-        bar.set_label(label, color=INK, labelpad=2, **FONT)
-        bar.ax.tick_params(labelsize=9, length=3, pad=2)
-
-    def png(self) -> bytes:
-        """Finish the sheet and return the file's bytes."""
-        return png_bytes(self.finished())
+        colour_bar(self.figure.add_axes(self._bar), ScalarMappable(norm, shades), label, extend=extend)
 
     def finished(self) -> Figure:
         """Add letters, marks and the scale bar, and return the figure."""
@@ -189,19 +177,16 @@ class Sheet:
             for number, (plane, axes) in enumerate(row.items()):
                 left, right, bottom, top = self.view.extent_mm(plane)
                 axes.set(xlim=(left, right), ylim=(bottom, top))
-                white: dict[str, Any] = {"color": "white", "path_effects": SHADOW, "transform": axes.transAxes}
                 _, across, along = AXES[plane]
-                marks = [float(self.view.index[a] * spacing[a]) for a in (across, along)]
-                for mark, line in zip(marks, (axes.axvline, axes.axhline), strict=True):
-                    for low, high in ((0.0, 0.035), (0.965, 1.0)):
-                        line(mark, low, high, color=_MARK, linewidth=1.2)
-                x, y = _beside((marks[0] - left) / (right - left)), _beside((marks[1] - bottom) / (top - bottom))
-                sides = (0.012, y, "left", "center"), (0.988, y, "right", "center")
-                spots = *sides, (x, 0.988, "center", "top"), (x, 0.012, "center", "bottom")
-                for letter, (x, y, ha, va) in zip(LETTERS[plane], spots, strict=True):
-                    axes.text(x, y, letter, ha=ha, va=va, weight="bold", zorder=9, **white, **FONT)
+                at = [self.view.index[a] * spacing[a] for a in (across, along)]
+                x, y = (at[0] - left) / (right - left), (at[1] - bottom) / (top - bottom)
+                ends = (0.0, 0.035), (0.965, 1.0)
+                marks = [[(x, a), (x, b)] for a, b in ends] + [[(a, y), (b, y)] for a, b in ends]
+                how: dict[str, Any] = {"colors": _MARK, "linewidths": 1.2, "transform": axes.transAxes}
+                axes.add_collection(LineCollection(marks, **how), autolim=False)
+                name_sides(axes, LETTERS[plane], (_beside(x), _beside(y)), **ON_DARK)
                 if number == 0:
-                    scale_bar(axes, right - left)
+                    scale_bar(axes, right - left, **ON_DARK)
         return self.figure
 
 
@@ -218,12 +203,29 @@ def outline(
             axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
 
 
-def scale_bar(axes: Axes, width_mm: float) -> None:
+def slice_panel(figure: Figure, box: tuple[float, float, float, float], ground: str = "black") -> Axes:
+    """A panel without axes for a slice, in a box (left, bottom, width, height) of the figure."""
+    axes = figure.add_axes(box, facecolor=ground)
+    axes.xaxis.set_visible(False)
+    axes.yaxis.set_visible(False)
+    return axes
+
+
+def name_sides(axes: Axes, sides: Iterable[str], middle: tuple[float, float] = (0.5, 0.5), **how: Any) -> None:
+    """Write letters of the sides of the body at a panel's left, right, top and bottom, there at its middle or so."""
+    x, y = middle
+    left_right = (0.015, y, "left", "center"), (0.985, y, "right", "center")
+    spots = *left_right, (x, 0.985, "center", "top"), (x, 0.015, "center", "bottom")
+    for side, (at, height, ha, va) in zip(sides, spots, strict=True):
+        axes.text(at, height, side, ha=ha, va=va, zorder=9, transform=axes.transAxes, **how, **BOLD)
+
+
+def scale_bar(axes: Axes, width_mm: float, **how: Any) -> None:
     """Draw a bar of a round length in the lower left corner of a panel that is so wide."""
-    white: dict[str, Any] = {"color": "white", "path_effects": SHADOW, "transform": axes.transAxes}
     length = scale_length_mm(width_mm)
-    axes.plot([0.03, 0.03 + length / width_mm], [0.035, 0.035], linewidth=2.5, solid_capstyle="butt", **white)
-    axes.text(0.03, 0.05, f"{length:g} mm", va="bottom", fontsize=9, **white)
+    ends, how = [0.03, 0.03 + length / width_mm], how | {"transform": axes.transAxes}
+    axes.plot(ends, [0.035, 0.035], linewidth=2.5, solid_capstyle="butt", **how)
+    axes.text(0.03, 0.05, f"{length:g} mm", va="bottom", **how, **SMALL)
 
 
 def _beside(mark: float) -> float:
@@ -240,46 +242,9 @@ def scale_length_mm(width_mm: float) -> float:
     return max((n for n in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0) if n <= width_mm / 3), default=1.0)
 
 
-def chart(panels: int = 1, page_wide: bool = False) -> tuple[Figure, tuple[Axes, ...]]:
-    """An empty figure with so many axes side by side, for curves; each a part of the page's width, or all that wide."""
-    size = (WIDTH_IN, 3.8) if page_wide else (0.62 * WIDTH_IN * panels, 3.9)
-    figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))
-
-
-def panels(count: int, most: int = 2, size_in: tuple[float, float] = (WIDTH_IN, 3.4)) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, at ``most`` so many in a row, each row of a width and height."""
-    rows, columns = -(-count // most), min(count, most)
-    figure = Figure(figsize=(size_in[0], size_in[1] * rows), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    spots = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for spot in spots[count:]:
-        spot.set_visible(False)
-    return figure, spots[:count]
-
-
-def label_axes(axes: Axes, x: str, y: str, title: str = "") -> None:
-    """Name the axes of a panel, give it a title, and draw its grid."""
-    axes.set_title(title, color=INK, **FONT)
-    axes.set_xlabel(x, color=INK, **FONT)
-    axes.set_ylabel(y, color=INK, **FONT)
-    axes.grid(True, color="#d9dee4", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=9)
-
-
-def png_bytes(figure: Figure) -> bytes:
-    """A figure as a PNG file's bytes; equal figures give equal bytes."""
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
-    return file.getvalue()
-
-
 def window_of(view: View, image: Values) -> tuple[float, float]:
-    """The values drawn black and white: the 0.5th and 99.7th percentile of what is shown."""
-    known = view.shown(image)
+    """The values drawn black and white: the 0.5th and 99.7th percentile of the three slices."""
+    known = np.concatenate([view.cut(image, plane).ravel() for plane in PLANES])
     known = known[np.isfinite(known)]
     low, high = np.percentile(known, (0.5, 99.7)) if known.size else (0.0, 1.0)
     return float(low), float(high if high > low else low + 1.0)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from dvc import read_labels
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
+from dvc.report.drawing import figure_files, save_figure
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
 from mrstrain.models.mesh import mesh as make_mesh
 from mrstrain.models.simulate import LOADS, simulate
@@ -67,8 +68,8 @@ def converge(
     edges_mm : sequence of float
         At least three edge lengths, mm.
     out : path
-        Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and ``convergence.png``. An
-        existing mesh that was made from the same label map is reused.
+        Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and its figure, as PNG and
+        PDF. An existing mesh that was made from the same label map is reused.
     loads, workers, progress
         As in `simulate`, with one material set.
 
@@ -151,9 +152,11 @@ def _write(done: Converged, edges: Sequence[float], record: dict[str, object]) -
         rows.append(asdict(row) | {"limit": limit})
         table.append([row.load, row.figure, *row.values, *limit.values()])
     head = ["load", "figure", *(f"edge_{e:g}_mm" for e in edges), "limit", "order", "scatter", "error_of_finest"]
-    write_csv(out / "convergence.csv", head, table)
-    curves = {f"{r.load}, {r.figure}": (r.values, r.limit) for r in done.rows if np.isfinite(r.limit.limit)}
-    (out / "convergence.png").unlink(missing_ok=True)
+    sizes = ["all", "size of the cells, mm", *done.sizes_mm, *([None] * len(fields(Limit)))]
+    write_csv(out / "convergence.csv", head, [sizes, *table])
+    curves = {(r.load, r.figure): (r.values, r.limit) for r in done.rows if np.isfinite(r.limit.limit)}
+    for earlier in figure_files(out / "convergence"):
+        earlier.unlink(missing_ok=True)
     if curves:
-        figures.write_figure(out / "convergence.png", figures.convergence(done.sizes_mm, curves))
+        save_figure(out / "convergence", figures.convergence(done.sizes_mm, curves))
     write_json(out / "convergence.json", {"sizes_mm": list(done.sizes_mm), "rows": rows} | record)

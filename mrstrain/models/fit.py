@@ -7,12 +7,13 @@ import numpy as np
 
 import fe
 from dvc.atomic_files import write_csv, write_json, write_whole
+from dvc.report.drawing import save_figure
 from fe import Fit, Material, Ogden, as_toml, figures, read_curves
 from fe.hyperelastic import OGDEN
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
-_FILES = ["fit.json", "fit.csv", "fit.png", "material.toml"]
+_FILES = ["fit.json", "fit.csv", "fit.png", "fit.pdf", "material.toml"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +81,8 @@ def fit(
     law : str
         A name of `fe.LAWS`.
     out : path
-        Gets ``fit.json``, ``fit.csv`` (measured and fitted), ``fit.png``, and ``material.toml``, a material set with
-        the fitted model.
+        Gets ``fit.json``, ``fit.csv`` (measured and fitted), its figure ``fit.png`` and ``fit.pdf``, and
+        ``material.toml``, a material set with the fitted model.
     test : str, optional
         Kind of test if the file has no column for it: uniaxial, equibiaxial, pure shear.
     nu : float
@@ -114,7 +115,7 @@ def fit(
         numbers = np.column_stack([c.stretch, 1000.0 * c.stress_mpa, modelled])
         rows += [[c.mode, *(f"{value:.8g}" for value in row)] for row in numbers]
     write_csv(target / "fit.csv", ("test", "stretch", "nominal_stress_kpa", "fitted_kpa"), rows)
-    figures.write_figure(target / "fit.png", figures.stress_stretch(curves, fitted))
+    save_figure(target / "fit", figures.stress_stretch(curves, fitted))
     source = f"{law} fitted to {path.name}"
     if at_bound := [p.name for p in fitted.parameters if p.at_bound]:
         source += f", which does not determine {', '.join(at_bound)}"

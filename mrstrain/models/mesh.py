@@ -7,6 +7,7 @@ from pathlib import Path
 from dvc import TetMesh, read_labels
 from dvc.errors import InputError, OutputError
 from dvc.measurement.subject import is_bones_name
+from dvc.report.drawing import ENDINGS, save_figure
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
 from mrstrain.options.modelling import Labelling, Meshing
@@ -72,7 +73,7 @@ def mesh(
     labels : path
         As in `register`.
     out : path
-        The mesh, ending in .vtu; next to it are written a .json with names and quality, and a .png.
+        The mesh, ending in .vtu; next to it are written a .json with names and quality, and a slice as .png and .pdf.
     labelling, meshing, watch
         As in `fe.mesh_labels`.
 
@@ -84,7 +85,7 @@ def mesh(
     target, files = Path(out), {"labels": [Path(labels)], **labelling.files}
     if target.suffix.lower() != ".vtu":
         raise InputError(f"The output (out) is the mesh file and must end in .vtu; got {target}.")
-    written = [target.with_suffix(ending).resolve() for ending in (".vtu", ".json", ".png")]
+    written = [target.with_suffix(ending).resolve() for ending in (".vtu", ".json", *ENDINGS)]
     for path in (Path(labels), *labelling.paths):
         if path.resolve() in [target.resolve(), *written]:
             raise OutputError(f"{path} is an input and would be overwritten. Choose another output file (out).")
@@ -95,5 +96,5 @@ def mesh(
     del how["limit_s"]  # does not affect the mesh
     record = provenance("mesh", files, how | {"bones": list(labelling.bones)})
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
-    figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
+    save_figure(target.with_suffix(""), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
     return Meshed(target, made, quality)

@@ -10,7 +10,8 @@ import numpy as np
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
-from dvc.report.page import Picture, Section, Table, record_lines, write_report
+from dvc.report.drawing import Drawing
+from dvc.report.page import Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.records.inputs import make_output
 from mrstrain.records.progress import OnProgress
@@ -23,6 +24,7 @@ from mrstrain.studies.watch import Follower
 from validate import ALL, LEVELLED, NOTHING, CohortRank, over_subjects, rank_over_subjects
 
 _TOTAL = "all loads"
+_OVER_SUBJECTS = "normalised_area"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +118,7 @@ def cohort(
     write_csv(target / "ranking.csv", [f.name for f in fields(CohortRank)], map(astuple, ranking))
     files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
     write_json(target / PROVENANCE, record := provenance("cohort", {"studies": files}, {"subjects": names}))
-    sections = _sections(by_name, shares, ranking, notes)
+    sections = _sections(by_name, shares, ranking, notes, target)
     write_report(target / REPORT, "Models over subjects", None, sections, [], record_lines(record))
     return Cohort(target, tuple(ran), ranking, tuple(notes))
 
@@ -179,9 +181,9 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
 
 def _sections(
     ran: Mapping[str, StudyRun], shares: Mapping[str, Mapping[str, float]], ranking: Sequence[CohortRank],
-    notes: Sequence[str],
+    notes: Sequence[str], out: Path,
 ) -> list[Section]:  # fmt: skip
-    """Sections of the report: the models over all subjects, and the status of each subject."""
+    """Sections of the report: the models over all subjects, with their figure in ``out``, and each subject's status."""
     order = [s.model for s in ranking] or list(shares)
     ranked = Table(
         "Models over all subjects and loads, best first",
@@ -202,7 +204,9 @@ def _sections(
         "Normalised area by subject, %", ("subject", *order),
         tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in ran),
     )  # fmt: skip
-    drawn = Picture.drawn("Distribution over subjects", over_subjects, shares, order)
+    rows = [(subject, model, 100.0 * share) for model in order for subject, share in shares[model].items()]
+    data = dict(zip(("subject", "model", "normalised_area_percent"), zip(*rows, strict=True), strict=True))
+    drawn = Drawing.of("Distribution over subjects", over_subjects, shares, order, data=data).save(out / _OVER_SUBJECTS)
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for name, one in ran.items():
         failed = tuple(f"Incomplete: {outcome}" for outcome in one.outcomes.values() if outcome.record is None)

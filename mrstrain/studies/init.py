@@ -131,6 +131,7 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
 
 def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
     """The picture of the images, or why there is none, and the names of the labels."""
+    from dvc.report.drawing import png_bytes
     from mrstrain.studies.picture import Outlined, overview
 
     try:
@@ -143,7 +144,7 @@ def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
         others = {load: read_image(place / image, allow_missing=True) for load, image in found.loads.items()}
         names = [] if labels is None else [name for number, name in labels.names.items() if number != 0]
         with whole_file(place / PICTURE) as file:
-            file.write_bytes(overview(Outlined.of(unloaded, labels), others))
+            file.write_bytes(png_bytes(overview(Outlined.of(unloaded, labels), others)))
     except InputError as error:
         return f"none, {error}", []
     return place / PICTURE, names

@@ -1,33 +1,21 @@
 """The picture that `init` draws: the unloaded image with what is labelled on it, and every other image beside it."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Self
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
 
 from dvc import Image, LabelMap, fit_mask
 from dvc.arrays import BoolArray
 from dvc.errors import GeometryError
-from dvc.report.figures import REGION_COLOURS
-from dvc.report.sheet import (
-    FONT,
-    INK,
-    LETTERS,
-    PLANES,
-    SHADOW,
-    UNSEEN,
-    Plane,
-    View,
-    outline,
-    panels,
-    png_bytes,
-    scale_bar,
-    window_of,
-)
+from dvc.report.chart import panels
+from dvc.report.sheet import LETTERS, PLANES, UNSEEN, Plane, View, name_sides, outline, scale_bar, window_of
+from dvc.report.style import FAMILY, FONT, INK, ON_DARK, SMALL_PT, TISSUES, looks
 
-_COLOURS = (*REGION_COLOURS[:-1], "#F0E442")  # black would not show
 _IN_A_ROW, _PANEL_IN = 3, (9.8, 3.3)
 
 
@@ -49,10 +37,10 @@ class Outlined:
         return cls(image, {name: on_image.labels == n for n, name in names.items() if on_image is not None and n != 0})
 
 
-def overview(unloaded: Outlined, others: Mapping[str, Image]) -> bytes:
+def overview(unloaded: Outlined, others: Mapping[str, Image]) -> Figure:
     """Middle slices of the unloaded image in three planes with the outlines of its labels, and one of every other.
 
-    A PNG file's bytes. The slices meet in the middle of what is labelled, or of the image; letters are sides of the
+    The slices meet in the middle of what is labelled, or of the image; letters are sides of the
     body.
     """
     inside = [mask for mask in unloaded.regions.values() if mask.any()]
@@ -65,17 +53,12 @@ def overview(unloaded: Outlined, others: Mapping[str, Image]) -> bytes:
         at = middle if one.image.grid.contains(middle) else one.image.grid.centre_mm
         view = View.through(one.image.grid, at)
         _slice(axes, view, plane, one)
-        axes.set_title(f"{name}: {view.title(plane).lower()}", loc="left", color=INK, fontsize=9.5)
-    lines = [Line2D([], [], color=colour, label=name) for name, _, colour in _coloured(unloaded)]
+        axes.set_title(f"{name}: {view.title(plane).lower()}", loc="left", color=INK, **FONT)
+    lines = [Line2D([], [], label=name, **look.line) for name, look in looks(unloaded.regions, TISSUES).items()]
     if lines:
-        figure.legend(handles=lines, loc="outside lower center", ncols=6, frameon=False, prop={"size": 9.5})
-    return png_bytes(figure)
-
-
-def _coloured(one: Outlined) -> Iterator[tuple[str, BoolArray, str]]:
-    """Each region with its colour."""
-    for number, (name, mask) in enumerate(one.regions.items()):
-        yield name, mask, _COLOURS[number % len(_COLOURS)]
+        font = FontProperties(family=FAMILY, size=SMALL_PT)
+        figure.legend(handles=lines, loc="outside lower center", ncols=6, frameon=False, prop=font, labelcolor=INK)
+    return figure
 
 
 def _slice(axes: Axes, view: View, plane: Plane, one: Outlined) -> None:
@@ -83,10 +66,9 @@ def _slice(axes: Axes, view: View, plane: Plane, one: Outlined) -> None:
     extent = view.extent_mm(plane)
     low, high = window_of(view, one.image.values)
     axes.imshow(view.cut(one.image.values, plane), extent=extent, cmap="gray", vmin=low, vmax=high)
-    for _, mask, colour in sorted(_coloured(one), key=lambda region: -region[1].sum()):  # small ones over large ones
-        outline(axes, extent, [view.cut(mask, plane)], colour)
+    look = looks(one.regions, TISSUES)
+    for name, mask in sorted(one.regions.items(), key=lambda region: -region[1].sum()):  # small ones over large ones
+        outline(axes, extent, [view.cut(mask, plane)], look[name].colour)
     axes.set(xticks=[], yticks=[], facecolor=UNSEEN, xlim=extent[:2], ylim=extent[2:])
-    white: dict[str, Any] = {"color": "white", "weight": "bold", "path_effects": SHADOW, "transform": axes.transAxes}
-    for letter, x, y in zip(LETTERS[plane], (0.03, 0.97, 0.5, 0.5), (0.5, 0.5, 0.96, 0.04), strict=True):
-        axes.text(x, y, letter, ha="center", va="center", **white, **FONT)
-    scale_bar(axes, extent[1] - extent[0])
+    name_sides(axes, LETTERS[plane], **ON_DARK)
+    scale_bar(axes, extent[1] - extent[0], **ON_DARK)

@@ -8,15 +8,22 @@ from typing import Any, Self, TypeVar
 
 import phantoms
 from dvc import engine_named
-from dvc.atomic_files import write_csv, write_json
-from dvc.io.result_folder import PROVENANCE, REPORT
-from dvc.report.page import Picture, Section, Table, record_lines, write_report
+from dvc.atomic_files import whole_folder, write_csv, write_json
+from dvc.io.result_folder import FIGURES, PROVENANCE, REPORT
+from dvc.report.drawing import Drawing
+from dvc.report.page import Section, Table, record_lines, write_report
 from dvc.trust.error_model import POOLED
 from mrstrain.records.provenance import provenance
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow, figures, wavelength_recovered
 
 _R = TypeVar("_R", ErrorRow, ResolutionRow)
 _CONDITION = ("preset", "voxel, mm", "SNR")
+_PLACES = {
+    "error_by_distance_to_bone": "distance to bone, mm",
+    "error_by_distance_to_interface": "distance to a border, mm",
+    "error_by_strain": "true maximum shear strain",
+}
+"""Stems of the files of figures, and what the errors are shown by there."""
 _HOW_TO_READ = (
     "Every pair is a synthetic heel whose strain is known at every point. The error is measured minus true: of the "
     "maximum shear strain (E1 - E3)/2 (Green-Lagrange), and of the displacement of tissue relative to its bone, at one"
@@ -40,7 +47,7 @@ class AccuracyStudy:
     ----------
     out : Path
         Folder of ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, ``coverage.csv``, an error model of each
-        preset and ``report.html``.
+        preset, ``figures`` and ``report.html``.
     errors, floors, resolution, coverage : tuple of rows
         Rows of the tables.
     failures : dict
@@ -80,7 +87,9 @@ class AccuracyStudy:
         write_json(out / PROVENANCE, record)
         study = cls(out, errors, floors, resolution, coverage, failures)
         title, closing = "Accuracy of registration presets", (Section("How to read this", paragraphs=_HOW_TO_READ),)
-        write_report(out / REPORT, title, None, study._sections(), closing, record_lines(record))
+        with whole_folder(out / FIGURES) as folder:
+            sections = study._sections(folder)
+        write_report(out / REPORT, title, None, sections, closing, record_lines(record))
         return study
 
     @property
@@ -99,10 +108,11 @@ class AccuracyStudy:
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
         return [*lines, f"Report: {self.out / REPORT}"]
 
-    def _sections(self) -> list[Section]:
-        sections = [_condition_section(*of_one) for of_one in _by_condition(self.errors, self.floors)]
+    def _sections(self, folder: Path) -> list[Section]:
+        """The report's sections; their figures are written to a folder."""
+        sections = [_condition_section(*of_one, folder) for of_one in _by_condition(self.errors, self.floors)]
         if self.resolution:
-            sections.append(_resolution_section(self.floors, self.resolution))
+            sections.append(_resolution_section(self.floors, self.resolution, folder))
         if self.coverage:
             sections.append(_coverage_section(self.coverage))
         if self.failures:
@@ -134,7 +144,7 @@ def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tu
         yield [r for r in rows if r.condition == condition], [f for f in floors if f.condition == condition]
 
 
-def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> Section:
+def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], folder: Path) -> Section:
     head = ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95")
     values = attrgetter(
         "tissue", "true_p50", "true_p95", "shear_bias", "shear_sd", "shear_rmse", "shear_p95", "u_rmse_mm", "u_p95_mm"
@@ -146,12 +156,17 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
         noise = tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in floors)
         tables.append(Table("Noise floor: apparent strain between two unloaded scans", of_floor, noise, _OF_FLOOR))
-    pictures = tuple(
-        Picture.drawn(f"Error by {figures.words(by).split(',')[0]}", figures.errors_by_place, errors, by)
-        for by in ("distance to bone, mm", "distance to a border, mm", "true maximum shear strain")
-    )
     preset, voxel, snr = errors[0].condition
-    return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=pictures)
+    pictures = []
+    for stem, by in _PLACES.items():
+        pooled = figures.pooled_errors(errors, by)
+        columns = (by.replace(", mm", "_mm").replace(" ", "_"), "max_shear_rmse", "max_shear_bias")
+        data = dict(zip(("tissue", *columns), zip(*pooled, strict=True) if pooled else ((),) * 4, strict=True))
+        title = f"Error by {figures.words(by).split(',')[0]}"
+        drawing = Drawing.of(title, figures.errors_by_place, pooled, by, data=data)
+        where = f"{Path(preset).stem}_{voxel.replace(' ', '')}mm_snr{snr:g}"
+        pictures.append(drawing.save(folder / f"{stem}_{where}"))
+    return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=tuple(pictures))
 
 
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
@@ -168,15 +183,19 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
     return Section("Validation of the error model", tables=(table,))
 
 
-def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow]) -> Section:
+def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], folder: Path) -> Section:
     table_rows = []
     for of_condition, still in _by_condition(rows, floors):
         noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == POOLED), (None, None, None))
         wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
         table_rows.append((*of_condition[0].condition, *wavelengths, *noise))
     columns = (*_CONDITION, "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
-    pictures = [Picture.drawn("Spatial resolution", figures.resolution, rows)]
-    if floors:
-        pictures.append(Picture.drawn("Noise against resolution", figures.trade_off, floors, rows, POOLED))
+    drawings = {"resolution": Drawing.of("Spatial resolution", figures.resolution, rows)}
+    if known := figures.noise_and_resolution(floors, rows, POOLED):
+        names = ("condition", "wavelength_recovered_to_90_percent_mm", "max_shear_without_load")
+        data = dict(zip(names, zip(*known, strict=True), strict=True))
+        drawing = Drawing.of("Noise against resolution", figures.trade_off, known, POOLED, data=data)
+        drawings["noise_and_resolution"] = drawing
+    pictures = [drawing.save(folder / stem) for stem, drawing in drawings.items()]
     table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows), _OF_FLOOR)
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

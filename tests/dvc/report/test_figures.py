@@ -1,4 +1,4 @@
-"""What is drawn lies where it should: orientation, scale, missing values, and every figure is a PNG."""
+"""What is drawn lies where it should: orientation, scale, missing values, and every figure can be read."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import matplotlib.image
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, Image, LabelMap
 from dvc.report import figures
+from dvc.report.drawing import png_bytes
 from dvc.report.sheet import LETTERS, PLANES, UNSEEN, Plane, Sheet, View
 
 # Where a point that lies 12 mm off the centre in one direction must appear: (across, down), -1, 0 or 1.
@@ -39,8 +41,8 @@ def grid_with(order: tuple[int, ...], signs: tuple[int, ...]) -> Grid:
     return Grid(shape, spacing, CENTRE - direction @ (spacing * (np.array(shape) - 1) / 2), direction)
 
 
-def pixels(png: bytes) -> np.ndarray:
-    return matplotlib.image.imread(io.BytesIO(png), format="png")[..., :3]
+def pixels(figure: Figure) -> np.ndarray:
+    return matplotlib.image.imread(io.BytesIO(png_bytes(figure)), format="png")[..., :3]
 
 
 ALL_AXES = [(o, s) for o in permutations(range(3)) for s in product((1, -1), repeat=3)]
@@ -133,7 +135,7 @@ LABELS = LabelMap(GRID, (RADIUS < 15).astype(int) + (RADIUS < 6), {1: "fat <i>$"
 MOVED = np.where((RADIUS < 15)[..., None], GRID.points() * 0.0 + [1.0, 2.0, 3.0], np.nan).astype(np.float32)
 NOTHING = np.full(GRID.shape, np.nan, dtype=np.float32)
 
-DRAWN: dict[str, Callable[[np.ndarray], bytes]] = {
+DRAWN: dict[str, Callable[[np.ndarray], Figure]] = {
     "overlay": lambda a: figures.overlay(VIEW, REFERENCE, a, a),
     "checkerboard": lambda a: figures.checkerboard(VIEW, REFERENCE, a, a),
     "strain": lambda a: figures.strain_slices(VIEW, REFERENCE, a, 0.5, LABELS),
@@ -147,17 +149,17 @@ DRAWN: dict[str, Callable[[np.ndarray], bytes]] = {
 @pytest.mark.parametrize("name", DRAWN)
 @pytest.mark.parametrize("values", [SHEAR, NOTHING], ids=["values", "nothing known"])
 def test_every_figure_is_a_png_of_readable_size_and_repeats(name: str, values: np.ndarray) -> None:
-    png = DRAWN[name](values)
-    height, width = pixels(png).shape[:2]
+    png = png_bytes(DRAWN[name](values))
+    height, width = pixels(DRAWN[name](values)).shape[:2]
     assert 600 <= width <= 1200
     assert 250 <= height <= 1200
     assert len(png) < 1_500_000
-    assert png == DRAWN[name](values)
+    assert png == png_bytes(DRAWN[name](values))
     assert b"matplotlib" not in png.lower()
 
 
 @pytest.mark.parametrize("draw", [figures.overlay, figures.checkerboard])
-def test_what_the_loaded_scan_does_not_show_is_not_drawn_as_dark(draw: Callable[..., bytes]) -> None:
+def test_what_the_loaded_scan_does_not_show_is_not_drawn_as_dark(draw: Callable[..., Figure]) -> None:
     half = REFERENCE.values.copy()
     half[GRID.points()[..., 0] > CENTRE[0]] = np.nan  # the patient's left
     blue = [

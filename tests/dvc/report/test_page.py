@@ -16,6 +16,7 @@ from PIL import Image as Pixels
 
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, LabelMap
+from dvc.report.drawing import png_bytes
 from dvc.report.figures import shear_curves
 from dvc.report.page import Picture, Section, Table, Viewer, Volume, shown, write_report
 from dvc.trust.verdict import Verdict
@@ -27,7 +28,7 @@ TRUST, FOLDS = Verdict("trust"), Verdict("distrust", (f"It folds {ATTACK}.",))
 def png() -> bytes:
     grid = Grid((2, 2, 2), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
     labels = LabelMap(grid, np.ones(grid.shape, dtype=int), {1: "fat"})
-    return shear_curves(np.full(grid.shape, 0.1, dtype=np.float32), labels)
+    return png_bytes(shear_curves(np.full(grid.shape, 0.1, dtype=np.float32), labels))
 
 
 class Page(HTMLParser):
