@@ -91,39 +91,47 @@ def _in_slice(view: View, plane: Plane) -> BoolArray:
 def strain_by_load(strips: Sequence[Strip], model: str, highest: float) -> Figure:
     """Maximum shear strain in one slice of the unloaded anatomy under each load: measured (top) and a model (bottom).
 
-    White lines are the surfaces of the body and of the bones. The image is grey where strain is not defined.
+    On the left, the unloaded image. White lines are the surfaces of the body and of the bones. The image is grey where
+    strain is not defined.
     """
     first = strips[0]
     left, right, bottom, top = first.extent_mm
     width_mm, height_mm = right - left, abs(top - bottom)
-    inches = min((WIDTH_IN - _SIDE_IN) / len(strips) / width_mm - _GAP_IN / width_mm, _TALLEST_IN / height_mm)
+    columns, sides_in = len(strips) + 1, _HEAD_IN + _SIDE_IN
+    inches = min(((WIDTH_IN - sides_in) / columns - _GAP_IN) / width_mm, _TALLEST_IN / height_mm)
     w, h = inches * width_mm, inches * height_mm
-    size = _SIDE_IN + len(strips) * (w + _GAP_IN), _HEAD_IN + 2 * (h + _GAP_IN) + _FOOT_IN
+    size = sides_in + columns * (w + _GAP_IN), _HEAD_IN + 2 * (h + _GAP_IN) + _FOOT_IN
     figure, norm = empty(size), Normalize(0.0, highest)
+    unloaded = slice_panel(figure, (0.0, (_FOOT_IN + (h + _GAP_IN) / 2) / size[1], w / size[0], h / size[1]))
+    _paint(unloaded, first, None, norm)
+    unloaded.set_title("Load0", color=INK, pad=4, **FONT)
+    name_sides(unloaded, LETTERS[first.plane], **ON_DARK)
+    scale_bar(unloaded, width_mm, **ON_DARK)
+    begin = w + _HEAD_IN
     for row, name in enumerate((MEASURED, model)):
         low = _FOOT_IN + (1 - row) * (h + _GAP_IN)
-        figure.text(0.12 / size[0], (low + h / 2) / size[1], name, rotation=90, va="center", color=INK, **FONT)
+        figure.text(
+            (begin + 0.12) / size[0], (low + h / 2) / size[1], name, rotation=90, va="center", color=INK, **FONT
+        )
         for column, strip in enumerate(strips):
-            box = (_SIDE_IN + column * (w + _GAP_IN)) / size[0], low / size[1], w / size[0], h / size[1]
+            box = (begin + _SIDE_IN + column * (w + _GAP_IN)) / size[0], low / size[1], w / size[0], h / size[1]
             axes = slice_panel(figure, box)
             _paint(axes, strip, name, norm)
             if row == 0:
                 axes.set_title(strip.load, color=INK, pad=4, **FONT)
-            name_sides(axes, LETTERS[strip.plane], **ON_DARK)
-            if row == column == 0:
-                scale_bar(axes, width_mm, **ON_DARK)
     length = min(4.2, 0.6 * size[0])
     bar = figure.add_axes(((size[0] - length) / 2 / size[0], 0.42 / size[1], length / size[0], 0.12 / size[1]))
     colour_bar(bar, ScalarMappable(norm, _COLOURS), MAX_SHEAR, "max")
     return figure
 
 
-def _paint(axes: Axes, strip: Strip, name: str, norm: Normalize) -> None:
+def _paint(axes: Axes, strip: Strip, name: str | None, norm: Normalize) -> None:
+    """Draw a slice of the unloaded image, with the strain that was measured or that a model gives, if one is named."""
     how: dict[str, Any] = {"extent": strip.extent_mm, "origin": "upper", "aspect": "auto"}
     axes.imshow(strip.image, cmap="gray", vmin=0.0, vmax=1.0, **how)
-    values: npt.NDArray[Any] | None = strip.max_shear.get(name)
-    if values is None:
+    values: npt.NDArray[Any] | None = None if name is None else strip.max_shear.get(name)
+    if values is None and name is not None:
         axes.text(0.5, 0.5, "no result", transform=axes.transAxes, ha="center", **ON_DARK, **FONT)
-    else:
+    elif values is not None:
         axes.imshow(np.ma.masked_invalid(values), cmap=_COLOURS, norm=norm, interpolation="nearest", **how)
     outline(axes, strip.extent_mm, strip.outlines)

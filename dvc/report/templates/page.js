@@ -1,3 +1,6 @@
+/* On a narrow screen the contents stand above the page: the answer comes first. */
+const contents = document.getElementById("contents");
+if (contents && matchMedia("(max-width: 68rem)").matches) contents.open = false;
 /* Folded parts open for a link that leads there, and for print. */
 const unfolded = () => {
   const part = location.hash.length > 1 && document.getElementById(location.hash.slice(1));

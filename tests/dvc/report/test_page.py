@@ -121,7 +121,7 @@ def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_pat
     sections = [Section("Load1"), Section("Load1, cell by cell", folded=True)]
     write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {})
     parts = {str(a["id"]): "open" in a for a in Page((tmp_path / "r.html").read_text()).all("details")}
-    assert parts == {"part-1": True, "part-2": False, "closing-1": False, "provenance": False}
+    assert parts == {"contents": True, "part-1": True, "part-2": False, "closing-1": False, "provenance": False}
 
 
 def test_a_picture_on_the_page_is_smaller_than_its_file_and_looks_the_same() -> None:
