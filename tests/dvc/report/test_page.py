@@ -119,7 +119,7 @@ def test_verdict_stands_before_all_else_and_in_words(html: str) -> None:
 
 def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_path: Path) -> None:
     sections = [Section("Load1"), Section("Load1, cell by cell", folded=True)]
-    write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {})
+    write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {"seed": "1"})
     parts = {str(a["id"]): "open" in a for a in Page((tmp_path / "r.html").read_text()).all("details")}
     assert parts == {"contents": True, "part-1": True, "part-2": False, "closing-1": False, "provenance": False}
 
