@@ -106,7 +106,7 @@ def test_others_refuse_as_well() -> None:
         (lambda: fe.mesh_labels("a.nii", 5.0), "labels must be a dvc.LabelMap.*; got 'a.nii'"),
         (lambda: fe.mesh_labels(LABELS, 5.0, bones="bone"), "bones must be a list.*; got 'bone'"),
         (lambda: fe.write_tet_mesh(dome((2, 3, 3)), "b.vtu"), "path must be the path.*; got TetMesh"),
-        (lambda: fe.write_tet_mesh("b.xyz", dome((2, 3, 3))), r"let its name end in \.vtu"),
+        (lambda: fe.write_tet_mesh("b.xyz", dome((2, 3, 3))), r"must end in \.vtu"),
         (lambda: fe.simulate(dome((2, 3, 3)), "trebbi", plate, [load], fixed="bone"), "fixed must be a list.*'bone'"),
         (lambda: fe.simulate(dome((2, 3, 3)), "trebbi", plate, [load], options={}), "options must be a fe.SolverOpt"),
     ):  # fmt: skip

@@ -118,7 +118,7 @@ def test_a_misspelt_set_or_region_is_refused_before_meshing(tmp_path: Path) -> N
     write_labels(tmp_path / "map.nii.gz", half_onion())
     for wrong, said in (
         ({"material": "trebi"}, "did you mean 'trebbi'"),
-        ({"region": "fatt"}, "No soft tissue 'fatt'"),
+        ({"region": "fatt"}, "no soft tissue 'fatt'"),
     ):
         with pytest.raises(InputError, match=said):
             converge(

@@ -177,18 +177,18 @@ def test_curves_that_tell_nothing_are_refused() -> None:
     fat, stretch = NeoHooke.of(0.01), np.linspace(0.8, 1.2, 20)
     with pytest.raises(InputError, match="Unknown model 'Mooney'"):
         fit([curve_of(fat, stretch)], "Mooney")
-    with pytest.raises(InputError, match="needs 5 points or more"):
+    with pytest.raises(InputError, match="needs at least 5 points"):
         fit([curve_of(fat, stretch[:4])], "Yeoh")
-    with pytest.raises(InputError, match="needs 4 points or more"):
+    with pytest.raises(InputError, match="needs at least 4 points"):
         fit([curve_of(fat, np.full(20, 1.2))], "Isihara")
     with pytest.raises(InputError, match="0 at every point"):
         fit([Curve("uniaxial", stretch, np.zeros(20))], "neo-Hooke")
-    with pytest.raises(InputError, match="sign opposite to the stretch"):
+    with pytest.raises(InputError, match="has the wrong sign"):
         fit([Curve("uniaxial", stretch, -(stretch - 1))], "neo-Hooke")
-    with pytest.raises(InputError, match="Poisson's ratio must lie between 0 and"):
+    with pytest.raises(InputError, match="Poisson's ratio must be between 0 and"):
         fit([curve_of(fat, stretch)], "neo-Hooke", nu=0.5)
     bent = np.linspace(1.0, 1.5, 20)
-    with pytest.raises(InputError, match="no usable material law"):
+    with pytest.raises(InputError, match="not a valid material"):
         fit([Curve("uniaxial", bent, (bent - 1.0) ** 3 - 0.02 * (bent - 1.0))], "Yeoh")
-    with pytest.raises(InputError, match="Cannot read the curve nowhere"):
+    with pytest.raises(InputError, match="nowhere.*the curve cannot be read"):
         read_curves("nowhere.csv", "uniaxial")

@@ -180,7 +180,7 @@ def test_what_cannot_be_meshed_is_refused() -> None:
             mesh_labels(labels, edge)
     with pytest.raises(InputError, match="no region 'calcaneus'; it has bone, fat, skin"):
         mesh_labels(labels, 4.0, bones=("calcaneus",))
-    with pytest.raises(InputError, match="No soft tissue"):
+    with pytest.raises(InputError, match="no soft tissue"):
         mesh_labels(labels, 4.0, bones=("bone", "fat", "skin"))
     with pytest.raises(InputError, match="finer edge length"):
         mesh_labels(labels, 4.0, finer=("skin", 6.0))

@@ -230,9 +230,9 @@ def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Pat
     swollen = written("swollen", mesh.points_mm, 0.1 * mesh.points_mm)
     done = compare(study / "measured", [a_bit, moving, swollen], **given(study))
     for name, words in (
-        ("a bit", "is its frame right"),
+        ("a bit", "check its frame"),
         ("moving", "mm at the bone"),
-        ("swollen", "change their volume by 33%"),
+        ("swollen", "mean change of cell volume is 33%"),
     ):
         assert any(name in note and words in note for note in done.comparison.notes), (name, done.comparison.notes)
 

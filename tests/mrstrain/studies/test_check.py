@@ -175,7 +175,7 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
     (study / "study.toml").write_text(
         STUDY.replace(*align).replace('sets = ["mine.toml", "friedman"]', 'sets = ["friedman"]\nlevel = true')
     )
-    with pytest.raises(InputError, match="level = true needs a bone"):
+    with pytest.raises(InputError, match="level = true needs a rigid bone"):
         plan(read_study(study))
 
 

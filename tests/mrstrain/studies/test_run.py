@@ -383,6 +383,8 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
     ledger = places[1] / "results" / ".study" / "register Load1.json"
     ledger.write_text(re.sub(r'"level":"(trust|caution)"', '"level":"distrust"', ledger.read_text()))
     doubtful = [note for note in cohort(places, out=tmp_path / "cohort").notes if "Do not trust" in note]
-    assert [note.split(",")[0] for note in doubtful] == ["Ben: the registration of Load1 is not to be trusted"]
+    assert [note.split(",")[0] for note in doubtful] == [
+        "Ben: the verdict on the registration of Load1 is Do not trust"
+    ]
     with pytest.raises(InputError, match="different names"):
         cohort([places[0], places[0]], out=tmp_path / "cohort")
