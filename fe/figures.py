@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _POINTS = 200
 _FLAT_MM = 0.1
+_MANY = 30_000  # polygons: beyond, a PDF holds them as an image, which is then the smaller
 _STEEPEST = 0.05  # smallest component of the plate's normal along the normal force at which the plate is drawn
 _MARGIN_MM = 7.0  # around what is drawn, for the letters
 _GAP_IN, _TITLE_IN, _BAR_IN, _TALLEST_IN, _NARROWEST_IN = 0.1, 0.3, 0.66, 4.6, 5.2
@@ -116,24 +117,24 @@ def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_
     norm = Normalize(0.0, max(0.05, float(np.ceil(20.0 * most) / 20.0)))
     shades = colormaps["viridis"].with_extremes(bad=_UNKNOWN)
     corners = [corner for _, polygons in cuts for corner in polygons]
-    figure, spots, bar = _slice_panels([field.title for field in fields], corners, axes, bar=True)
+    figure, spots, bar = _slice_panels([field.title for field in fields], corners, axes)
+    many = len(corners) > _MANY
     for spot, field, (cells, polygons) in zip(spots, fields, cuts, strict=True):
         values = np.ma.masked_invalid(field.max_shear[cells])
         how: dict[str, Any] = {"cmap": shades, "norm": norm, "edgecolors": "face", "linewidths": 0.2}
-        spot.add_collection(PolyCollection(polygons, array=values, rasterized=True, **how), autolim=False)
+        spot.add_collection(PolyCollection(polygons, array=values, rasterized=many, **how), autolim=False)
         if field.face is not None:
             spot.axline((0.0, field.face[0]), slope=field.face[1], color=INK, linewidth=1.0, linestyle="--")
-    assert bar is not None
     colour_bar(bar, ScalarMappable(norm, shades), MAX_SHEAR, "max")
     return figure
 
 
 def _slice_panels(
-    titles: Sequence[str], corners: Sequence[FloatArray], axes: FloatArray, bar: bool = False
-) -> tuple[Figure, list[Axes], Axes | None]:
-    """Panels for a slice along the first two of the plate's axes, around polygons, with letters and a scale bar.
+    titles: Sequence[str], corners: Sequence[FloatArray], axes: FloatArray
+) -> tuple[Figure, list[Axes], Axes]:
+    """Panels for a slice along the first two of the plate's axes, around polygons, and one for a colour bar below.
 
-    With ``bar`` also room for a colour bar.
+    They have letters and a scale bar.
     """
     every = np.concatenate(corners)
     low, high = every.min(axis=0) - _MARGIN_MM, every.max(axis=0) + _MARGIN_MM
@@ -142,7 +143,7 @@ def _slice_panels(
     rows = -(-len(titles) // columns)
     inches = min((WIDTH_IN - _GAP_IN * (columns - 1)) / columns / width_mm, _TALLEST_IN / height_mm)
     w, h = inches * width_mm, inches * height_mm
-    foot = _BAR_IN * bar + _GAP_IN
+    foot = _BAR_IN + _GAP_IN
     size = max(_NARROWEST_IN, columns * (w + _GAP_IN) - _GAP_IN), rows * (h + _TITLE_IN) + foot
     figure, spots, indent = empty(size), [], (size[0] - columns * (w + _GAP_IN) + _GAP_IN) / 2
     for number, title in enumerate(titles):
@@ -156,8 +157,6 @@ def _slice_panels(
         name_sides(spot, sides, **ON_LIGHT)
         scale_bar(spot, width_mm, **ON_LIGHT)
         spots.append(spot)
-    if not bar:
-        return figure, spots, None
     length = 0.43 * size[0]
     at = (0.5 * (size[0] - length) / size[0], 0.45 / size[1], length / size[0], 0.13 / size[1])
     return figure, spots, figure.add_axes(at)
@@ -209,13 +208,14 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
     """The mesh in a slice through the lowest point of the bone, coloured by tissue."""
     point = _lowest_bone_point(mesh, plate.axes)
     cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, point)
-    figure, (panel,), _ = _slice_panels(["Unloaded"], corners, plate.axes)
+    figure, (panel,), room = _slice_panels(["Unloaded"], corners, plate.axes)
     look = looks(mesh.regions, TISSUES)
     for name, members in mesh.regions.items():
         mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]
         how: dict[str, Any] = {"facecolors": look[name].colour, "edgecolors": "white", "linewidths": 0.3}
-        panel.add_collection(PolyCollection(mine, label=name, rasterized=True, **how), autolim=False)
-    legend(panel, loc="upper left")
+        panel.add_collection(PolyCollection(mine, label=name, **how), autolim=False)
+    room.set_axis_off()
+    legend(panel, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=4)
     return figure
 
 

@@ -153,7 +153,7 @@ def _write(done: Converged, edges: Sequence[float], record: dict[str, object]) -
         table.append([row.load, row.figure, *row.values, *limit.values()])
     head = ["load", "figure", *(f"edge_{e:g}_mm" for e in edges), "limit", "order", "scatter", "error_of_finest"]
     sizes = ["all", "size of the cells, mm", *done.sizes_mm, *([None] * len(fields(Limit)))]
-    write_csv(out / "convergence.csv", head, [sizes, *table])
+    write_csv(out / "convergence.csv", head, [*table, sizes])
     curves = {(r.load, r.figure): (r.values, r.limit) for r in done.rows if np.isfinite(r.limit.limit)}
     for earlier in figure_files(out / "convergence"):
         earlier.unlink(missing_ok=True)

@@ -77,7 +77,9 @@ def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: py
     assert done.exit_code == again.exit_code == 0, done.output + again.output
     assert made == sorted(counts, reverse=True)
     with (tmp_path / "study" / "convergence.csv").open(newline="") as file:
-        travel = next(csv.DictReader(file))
+        travel, *_, sizes = csv.DictReader(file)
+    assert (sizes["load"], sizes["figure"], sizes["limit"]) == ("all", "size of the cells, mm", "")
+    assert float(sizes["edge_6_mm"]) > 0.0
     assert travel["figure"] == "plate travel, mm"
     values = [float(travel[f"edge_{edge:g}_mm"]) for edge in counts]
     assert values == sorted(values)  # finer meshes are softer
@@ -104,7 +106,8 @@ def test_the_command(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximum shear strain of fat, p50"]
     assert 0.1 < float(rows[0]["edge_2.2_mm"]) < 10.0
-    assert any(row["limit"] for row in rows) == (out / "convergence.png").is_file()
+    for ending in ("png", "pdf"):
+        assert any(row["limit"] for row in rows) == (out / f"convergence.{ending}").is_file()
     before = (out / "mesh-3.2.vtu").read_bytes()
     again = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
     assert again.exit_code == 0

@@ -224,6 +224,7 @@ def test_the_command_writes_mesh_names_and_picture(tmp_path: Path) -> None:
     assert told["parameters"]["edge_mm"] == 5.0
     assert told["quality"]["cells"] > 100
     assert (tmp_path / "out" / "onion.png").stat().st_size > 10_000
+    assert 10_000 < (tmp_path / "out" / "onion.pdf").stat().st_size < 500_000
 
 
 def test_the_command_replaces_no_input(tmp_path: Path) -> None:

@@ -104,11 +104,23 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
             "curves.png",
             "slices.png",
             "agreement.png",
+            "agreement.pdf",
+            "agreement.csv",
+            "differences_shear.csv",
+            "differences_u.csv",
             "right_max_shear.nii.gz",
             "provenance.json",
         }
         fields = meshio.read(study / "out" / load / "fields.vtu").cell_data
         inside = fields["compared"][0] == 1.0
+        bins = rows(study / "out" / load / "agreement.csv")
+        assert {row["model"] for row in bins} == {"right", "half"}
+        tissue = [sum(float(row["volume_ml"]) for row in bins if row["model"] == name) for name in ("right", "half")]
+        assert tissue == pytest.approx([volume, volume], rel=1e-3)
+        middle = np.average(
+            *([float(r[of]) for r in bins if r["model"] == "half"] for of in ("simulated_max_shear", "volume_ml"))
+        )
+        assert middle == pytest.approx(0.5 * np.hypot(gamma / 2, gamma**2 / 8), abs=0.01)
         assert fields["half_max_shear"][0][inside] == pytest.approx(0.5 * np.hypot(gamma / 2, gamma**2 / 8))
     curves = [
         r

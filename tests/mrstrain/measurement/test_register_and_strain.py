@@ -86,7 +86,7 @@ PROMISED = [
     "TransformParameters.0.txt", "TransformParameters.1.txt", "transform.h5", "regions.csv", "quality.json",
     "provenance.json", "figures/strain.png", "figures/overlay.png", "figures/checkerboard.png",
     "figures/deformed_grid.png", "mesh.vtu", "nodal_displacements.csv", "sigma_max_shear.nii.gz", "intervals.csv",
-    "figures/sigma.png",
+    "figures/sigma.png", "figures/sigma.pdf", "figures/strain.pdf", "figures/curves.pdf", "figures/curves.csv",
 ]  # fmt: skip
 
 

@@ -35,6 +35,7 @@ def test_the_set_it_writes_is_the_law_that_made_the_curve(tmp_path: Path) -> Non
     assert told["parameters"][1]["value"] == pytest.approx(6.2)
     assert told["provenance"]["inputs"]["curve"][0]["name"] == "heel fat.csv"
     assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "fit.pdf").read_bytes().startswith(b"%PDF")
     rows = np.genfromtxt(out / "fit.csv", delimiter=",", skip_header=1, usecols=(1, 2, 3))
     assert rows[:, 1] == pytest.approx(rows[:, 2], abs=1e-6)
 

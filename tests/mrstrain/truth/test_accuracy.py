@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import shutil
 import signal
@@ -95,6 +96,15 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     page = (tmp_path / "report.html").read_text()
     assert "Spatial resolution" in page
     assert page.count("data:image/webp") == 5
+    made = [path.name for path in (tmp_path / "figures").iterdir()]
+    assert {"resolution.pdf", "noise_and_resolution.csv"} <= set(made)
+    (table,) = (tmp_path / "figures").glob("error_by_distance_to_bone_gauss-newton_*.csv")
+    with table.open(newline="") as file:
+        pooled = list(csv.DictReader(file))
+    nearest = next(row for row in pooled if row["tissue"] == "fat")
+    of_bin = next(r for r in study.errors if (r.motion, r.tissue, r.by) == ("Load1", "fat", "distance to bone, mm"))
+    assert float(nearest["distance_to_bone_mm"]) == pytest.approx(0.5 * (of_bin.low + of_bin.high))
+    assert float(nearest["max_shear_rmse"]) > 0.0
 
 
 def test_a_perfect_registration_has_no_error_and_resolves_the_wave(monkeypatch: pytest.MonkeyPatch) -> None:
