@@ -1,4 +1,4 @@
-"""The one style of all figures: font, sizes, colours that all common kinds of colour vision tell apart, and looks.
+"""The one style of all figures: font, sizes, colours for all common kinds of colour vision, and looks.
 
 The font is DejaVu Sans cut to the letters of Europe's languages, figures and signs (``fonts``, with its licence): a PDF
 holds the font it is set in, and cutting it out of the whole one takes longer than drawing the figure. Letters that it

@@ -20,11 +20,15 @@ _HIDDEN = ".study"
 
 
 def quantities(folder: Path) -> dict[str, Quantity]:
-    """Everything in images, meshes, tables and JSON files; provenance, prose, pictures and pages are left out."""
+    """Everything in images, meshes, tables and JSON files; provenance, prose, pages and pictures are left out.
+
+    So is the table beside a picture of its name: it holds what the picture shows of the maps and tables that are kept.
+    """
     found: dict[str, Quantity] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.name in _GIVEN or name.startswith(_HIDDEN):
+        shown = path.suffix == ".csv" and path.with_suffix(".pdf").is_file()
+        if path.name in _GIVEN or name.startswith(_HIDDEN) or shown:
             continue
         for end, read in _READERS.items():
             if name.endswith(end):
