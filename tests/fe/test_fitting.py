@@ -190,5 +190,5 @@ def test_curves_that_tell_nothing_are_refused() -> None:
     bent = np.linspace(1.0, 1.5, 20)
     with pytest.raises(InputError, match="not a valid material"):
         fit([Curve("uniaxial", bent, (bent - 1.0) ** 3 - 0.02 * (bent - 1.0))], "Yeoh")
-    with pytest.raises(InputError, match="nowhere.*the curve cannot be read"):
+    with pytest.raises(InputError, match=r"nowhere.*the curve cannot be read"):
         read_curves("nowhere.csv", "uniaxial")
