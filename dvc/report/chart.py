@@ -55,7 +55,7 @@ def number_axes(axes: Axes) -> None:
 
 
 def legend(axes: Axes, **where: Any) -> None:
-    """Give a panel its legend, if there is anything to tell apart."""
+    """Give a panel its legend, if anything in it has a label."""
     if axes.get_legend_handles_labels()[0]:
         font = FontProperties(family=FAMILY, size=SMALL_PT)
         axes.legend(prop=font, labelcolor=INK, frameon=False, **where)
