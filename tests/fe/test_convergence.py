@@ -133,5 +133,5 @@ def test_a_misspelt_set_or_region_is_refused_before_meshing(tmp_path: Path) -> N
 def test_two_sizes_are_too_few(tmp_path: Path) -> None:
     from mrstrain.models.converge import converge
 
-    with pytest.raises(InputError, match="3 edge lengths or more; got 2"):
+    with pytest.raises(InputError, match="at least 3 different edge lengths; got 2"):
         converge("map.nii.gz", [4.0, 2.0], out=tmp_path)
