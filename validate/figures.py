@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from matplotlib import colormaps
@@ -207,9 +207,8 @@ def _binned(bins: Mapping[str, Bins]) -> tuple[Figure, list[Axes]]:
     for spot, of in zip(spots, bins.values(), strict=True):
         shown = np.ma.masked_equal(of.volume_ml.T, 0.0)
         extent = (of.x[0], of.x[-1], of.y[0], of.y[-1])
-        spot.imshow(
-            shown, cmap=shades, norm=norm, origin="lower", extent=extent, aspect="auto", interpolation="nearest"
-        )
+        how: dict[str, Any] = {"cmap": shades, "norm": norm, "interpolation": "nearest", "zorder": 1.0}
+        spot.imshow(shown, origin="lower", extent=extent, aspect="auto", **how)  # above the grid
     shared_bar(spots, ScalarMappable(norm, shades), "volume in a square, mL")
     return figure, spots
 

@@ -116,7 +116,7 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
         bins = rows(study / "out" / load / "agreement.csv")
         assert {row["model"] for row in bins} == {"right", "half"}
         tissue = [sum(float(row["volume_ml"]) for row in bins if row["model"] == name) for name in ("right", "half")]
-        assert tissue == pytest.approx([volume, volume], rel=1e-3)
+        assert tissue == pytest.approx([volume, volume], rel=0.01)  # it ends at the 99.5th percentile
         middle = np.average(
             *([float(r[of]) for r in bins if r["model"] == "half"] for of in ("simulated_max_shear", "volume_ml"))
         )
