@@ -117,9 +117,9 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
         assert {row["model"] for row in bins} == {"right", "half"}
         tissue = [sum(float(row["volume_ml"]) for row in bins if row["model"] == name) for name in ("right", "half")]
         assert tissue == pytest.approx([volume, volume], rel=0.01)  # it ends at the 99.5th percentile
-        middle = np.average(
-            *([float(r[of]) for r in bins if r["model"] == "half"] for of in ("simulated_max_shear", "volume_ml"))
-        )
+        half = [(float(r["simulated_max_shear"]), float(r["volume_ml"])) for r in bins if r["model"] == "half"]
+        values, weights = zip(*half, strict=True)
+        middle = np.average(values, weights=weights)
         assert middle == pytest.approx(0.5 * np.hypot(gamma / 2, gamma**2 / 8), abs=0.01)
         assert fields["half_max_shear"][0][inside] == pytest.approx(0.5 * np.hypot(gamma / 2, gamma**2 / 8))
     curves = [
