@@ -58,25 +58,26 @@ class Worker(AbstractContextManager["Worker", None]):
         """
         with self._lock:
             executor = self._running()
-            future = executor.submit(task, *args)
-            while True:
-                try:
-                    return future.result(timeout=_POLL_S)  # type: ignore[no-any-return]
-                except FutureTimeout:
-                    if future.done():
-                        raise  # the task itself timed out on something; not ours to hide
-                    if watch is not None:
-                        watch()
-                except (TerminatedWorkerError, ShutdownExecutorError) as died:
-                    executor.shutdown(wait=False, kill_workers=True)
-                    self._executor = None
-                    code = re.search(r"\{(.*)\}", str(died), re.DOTALL)
-                    raise WorkerError(
-                        f"The process {what} died (exit code {code[1] if code else 'unknown'}): the system ended it, "
-                        "most often for lack of memory, or native code crashed. Free memory or use fewer --workers. In "
-                        "your own elastix parameter files with several metrics, set "
-                        '(UseMultiThreadingForMetrics "false").'
-                    ) from died
+            try:
+                future = executor.submit(task, *args)
+                while True:
+                    try:
+                        return future.result(timeout=_POLL_S)  # type: ignore[no-any-return]
+                    except FutureTimeout:
+                        if future.done():
+                            raise  # the task itself timed out on something; not ours to hide
+                        if watch is not None:
+                            watch()
+            except (TerminatedWorkerError, ShutdownExecutorError) as died:
+                executor.shutdown(wait=False, kill_workers=True)
+                self._executor = None
+                code = re.search(r"\{(.*)\}", str(died), re.DOTALL)
+                raise WorkerError(
+                    f"The process {what} died (exit code {code[1] if code else 'unknown'}): the system ended it, "
+                    "most often for lack of memory, or native code crashed. Free memory or use fewer --workers. In "
+                    "your own elastix parameter files with several metrics, set "
+                    '(UseMultiThreadingForMetrics "false").'
+                ) from died
 
     def _running(self) -> ProcessPoolExecutor:
         """The child process, started where there is none."""

@@ -230,9 +230,9 @@ def test_the_command_writes_mesh_names_and_picture(tmp_path: Path) -> None:
 def test_the_command_replaces_no_input(tmp_path: Path) -> None:
     from mrstrain.models.mesh import mesh
 
-    with pytest.raises(InputError, match=r"ends in \.vtu"):
+    with pytest.raises(InputError, match=r"must end in \.vtu"):
         mesh("a.nii.gz", out=tmp_path / "mesh.msh")
-    with pytest.raises(OutputError, match="would be replaced"):
+    with pytest.raises(OutputError, match="would be overwritten"):
         mesh("a.nii.gz", names=tmp_path / "heel.json", out=tmp_path / "heel.vtu")
 
 

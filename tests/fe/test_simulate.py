@@ -271,7 +271,7 @@ def test_a_travel_too_far_ends_with_the_last_state_in_balance() -> None:
 def test_a_load_is_a_force_or_a_travel(given: dict) -> None:
     with pytest.raises(InputError, match="either the normal force or the plate displacement"):
         LoadStep("x", **given)
-    with pytest.raises(InputError, match="either the shear force or the plate's displacement"):
+    with pytest.raises(InputError, match="either the shear force or the plate displacement"):
         LoadStep("x", 1.0, 1.0, shear_mm=1.0)
 
 

@@ -167,7 +167,7 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
     monkeypatch.setattr("mrstrain.studies.cohort.run_studies", ended)
     alike = cohort(places, out=tmp_path / "alike")
     assert not any("measured or simulated differently" in note for note in alike.notes)
-    assert "Mueller_Hans" not in "".join(file.read_text() for file in (tmp_path / "alike").iterdir())
+    assert "Mueller_Hans" not in "".join(file.read_text(errors="ignore") for file in (tmp_path / "alike").iterdir())
 
     other = places[1] / "study.toml"
     text = other.read_text()

@@ -121,7 +121,7 @@ def test_the_headline_is_the_best_match_or_the_area_of_the_best(comparison: Comp
     ranking = replace(comparison.ranking, statements=(doubt, best_match))
     assert comparison.headline == replace(comparison, ranking=ranking).headline == best_match
     without = replace(comparison, ranking=replace(comparison.ranking, statements=(doubt,)))
-    assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: area between curves ")
+    assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: area between strain-volume curves ")
 
 
 def test_plots_draw_the_curves_and_areas_themselves(comparison: Comparison) -> None:

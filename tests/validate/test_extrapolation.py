@@ -135,7 +135,8 @@ def test_levelling_takes_image_bone_and_engine_from_the_measurement(
     folder, measured = bumped.folder, bumped.folder / "measured" / "Load1"
     measured.mkdir(parents=True)
     write_displacement(measured, bumped.grid, np.zeros((*bumped.grid.shape, 3), dtype=np.float32))
-    given = {"load0": folder / "Load0.nii.gz", "bone": folder / "bone.nii.gz"}
+    given = {"load0": folder / "scan.nii.gz", "bone": folder / "bone.nii.gz"}
+    (folder / "Load0.nii.gz").rename(given["load0"])  # no other test has such a file
     stages = [{"name": "heel-mr", "text": load_preset("heel-mr").text}]
     record = provenance("register", given, {"engine": "elastix", "stages": stages})
     (measured / "provenance.json").write_text(json.dumps(record))
@@ -154,7 +155,7 @@ def test_levelling_takes_image_bone_and_engine_from_the_measurement(
     assert told["parameters"]["preset"] == "heel-mr"
     assert done.lines[0].startswith(f"From the record of {measured.parent}: --bone ")
     given["load0"].unlink()
-    with pytest.raises(InputError, match=r"unloaded image Load0.nii.gz .* in place of the results"):
+    with pytest.raises(InputError, match=r"unloaded image scan.nii.gz .* in place of the results"):
         level(measured.parent, folder / "model", out=folder / "out")
 
 

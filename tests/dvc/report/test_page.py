@@ -119,9 +119,15 @@ def test_verdict_stands_before_all_else_and_in_words(html: str) -> None:
 
 def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_path: Path) -> None:
     sections = [Section("Load1"), Section("Load1, cell by cell", folded=True)]
-    write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {"seed": "1"})
-    parts = {str(a["id"]): "open" in a for a in Page((tmp_path / "r.html").read_text()).all("details")}
+    write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {"command": "register"})
+    page = (tmp_path / "r.html").read_text()
+    parts = {str(a["id"]): "open" in a for a in Page(page).all("details")}
     assert parts == {"contents": True, "part-1": True, "part-2": False, "closing-1": False, "provenance": False}
+    assert "refresh" not in page
+    write_report(tmp_path / "r.html", "A heel", None, sections, (), {}, reload_s=10)  # in progress
+    page = (tmp_path / "r.html").read_text()
+    assert [a["id"] for a in Page(page).all("details")] == ["contents", "part-1", "part-2"]
+    assert [a["content"] for a in Page(page).all("meta") if a.get("http-equiv") == "refresh"] == ["10"]
 
 
 def test_a_picture_on_the_page_is_smaller_than_its_file_and_looks_the_same() -> None:

@@ -7,6 +7,7 @@ import csv
 import gzip
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -292,14 +293,16 @@ def test_the_command_takes_one_load_and_one_file(study: Path) -> None:
 
 def test_what_was_measured_with_is_not_asked_for_again(study: Path) -> None:
     load = study / "measured" / "Load1"
-    files = {"labels": study / "tissues.nii.gz", "names": study / "tissues.csv"}
+    files = {"labels": study / "measured.nii.gz", "names": study / "measured.csv"}  # no other test has such files
+    shutil.copy(study / "tissues.nii.gz", files["labels"])
+    shutil.copy(study / "tissues.csv", files["names"])
     axes = {"plate_normal_lps": (1.0, 0.0, 0.0), "shear_direction_lps": (0.0, 1.0, 0.0)}
     (load / "provenance.json").write_text(json.dumps(provenance("register", files, axes | {"bone_label": "bone"})))
     argv = ["compare", load, study / "half" / "Load1.vtu", "--out", study / "one"]
     ran = CliRunner().invoke(app, [str(a) for a in argv])
     assert ran.exit_code == 0, ran.output
     (taken,) = [line for line in ran.output.splitlines() if line.startswith(f"From the record of {load}: ")]
-    assert f"--labels {study / 'tissues.nii.gz'} --names {study / 'tissues.csv'} --bone bone " in taken
+    assert f"--labels {files['labels']} --names {files['names']} --bone bone " in taken
     assert taken.endswith(" --plate-normal 1 0 0 --shear-direction 0 1 0")
     told = json.loads((study / "one" / "comparison.json").read_text())
     for role, path in files.items():  # as if they had been given

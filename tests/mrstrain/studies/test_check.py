@@ -208,10 +208,10 @@ def test_larger_images_and_meshes_take_longer_and_more_memory(study):
         20.0 * costs.seconds_of(simulating, told, 0.0, 6e4)
     )
     assert costs.gib_of(simulating, exact, 0.0, 6e4) > 2.0 * costs.gib_of(simulating, told, 0.0, 6e4)
-    (study / "study.toml").write_text(STUDY.replace("[models]", "[models]\nlimit_minutes = 0.5"))
+    (study / "study.toml").write_text(STUDY.replace("[models]", "[models]\nlimit_minutes = 0.25"))
     limited = read_study(study)
     (simulating, *_) = (stage for stage in plan(limited) if stage.kind == "simulate")
-    assert costs.seconds_of(simulating, limited, 0.0, 6e4) == 30.0  # one load, one path
+    assert costs.seconds_of(simulating, limited, 0.0, 6e4) == 15.0  # one load, one path
     times = {}
     for name in ("friedman", "trebbi", "akrami"):  # the softer the fat, the longer
         (study / "study.toml").write_text(STUDY)
