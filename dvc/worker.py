@@ -147,6 +147,7 @@ def _workers(
     try:
         yield lambda task, items: pool.map(partial(one, task), items)
     except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)  # first, so that no thread begins the next item
         for worker in workers:
             worker.kill()
         raise

@@ -9,6 +9,7 @@ that deviation. This holds for tissue that is strained and imaged like the study
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
@@ -32,6 +33,7 @@ _STEPS = 4  # of the lattice that noise at scattered points is drawn on, within 
 _STEPS_OF_VOXELS = 2  # of the voxels at which truths of a map are drawn
 _MOST_NODES = 500_000  # of their lattice, which is coarser where it would have more
 _FEW = 2_000  # of a tissue's voxels on it, below which all are taken
+_HALF = 0.5 + 1e-6  # points half-way between nodes, as every second voxel may be, all take the upper one
 _DRAWS = 200
 
 
@@ -234,7 +236,7 @@ class GaussianField:
         self, points_mm: FloatArray, edges_mm: FloatArray, correlation_mm: float, random: np.random.Generator
     ) -> None:
         self._random, self._width = random, 0.5 * correlation_mm / edges_mm
-        index = np.rint((points_mm - points_mm.min(axis=0)) / edges_mm).astype(np.int64)
+        index = np.floor((points_mm - points_mm.min(axis=0)) / edges_mm + _HALF).astype(np.int64)
         # Room around, so that the field, which is periodic, does not meet itself.
         self._shape = tuple((index.max(axis=0) + 1 + np.ceil(6.0 * self._width).astype(np.int64)).tolist())
         self._at = np.ravel_multi_index(tuple(index.T), self._shape)
@@ -276,10 +278,13 @@ class TruthDraws:
             bias, sd = np.empty((2, len(shear)))
             for name, here in self._tissues.items():
                 bias[here], sd[here] = table.expected(name, shear[here], to_bone_mm[here], run)
-            self._expected.append((bias, sd))
-        self._variance = np.mean([sd**2 for _, sd in self._expected], axis=0)
+            self._expected.append((bias.astype(np.float32), sd.astype(np.float32)))
         edges = np.full(3, table.correlation_mm / _STEPS) if edges_mm is None else edges_mm
         self._noise = GaussianField(points_mm, edges, table.correlation_mm, self._random)
+
+    @cached_property
+    def _variance(self) -> FloatArray:
+        return np.asarray(np.mean([np.square(sd, dtype=np.float64) for _, sd in self._expected], axis=0))
 
     def drawn(self) -> FloatArray:
         """A truth (n,): the shear less a registration's bias, less a Gaussian field of its deviation; not below 0."""
@@ -326,23 +331,11 @@ def uncertainty_of(
     measured = {name: where for name, where in measured.items() if where.any()}
     if not measured:
         return Uncertainty(sigma, (), table)
-    body, about = np.any(list(measured.values()), axis=0), table.correlation_mm / _STEPS_OF_VOXELS / grid.spacing_mm
-    apart = _voxels_apart(body, about)
-    at = [_some_of(where, apart) for where in measured.values()]
-    every = tuple(np.concatenate(axis) for axis in zip(*at, strict=True))
-    ends = np.cumsum([len(some[0]) for some in at])
-    tissue = np.repeat(list(measured), np.diff(ends, prepend=0)).tolist()
-    points = np.stack(every, axis=1) * grid.spacing_mm
-    shear_there, edges = max_shear[every].astype(np.float64), np.array(apart) * grid.spacing_mm
-    draws = TruthDraws(points, shear_there, tissue, to_bone_mm[every], table, seed, edges)
     volumes = [np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0 for where in measured.values()]
-    drawn = []
-    for _ in range(_DRAWS):
-        truths = np.split(draws.drawn(), ends[:-1])
-        drawn.append([figures_of(truth, volume) for truth, volume in zip(truths, volumes, strict=True)])
+    drawn = _figures_drawn(max_shear, grid.spacing_mm, measured, volumes, to_bone_mm, table, seed)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS)]
     intervals = []
-    for (name, where), volume, figures in zip(measured.items(), volumes, np.swapaxes(drawn, 0, 1), strict=True):
+    for (name, where), volume, figures in zip(measured.items(), volumes, drawn, strict=True):
         shear, factor = max_shear[where].astype(np.float64), wider.get(name, 1.0)
         sigma[where] = factor * table.expected(name, shear, to_bone_mm[where])[1]
         low, middle, high = widened(figures, factor * table.factor)
@@ -350,6 +343,26 @@ def uncertainty_of(
         each = zip(names, figures_of(shear, volume), middle, low, high, strict=True)
         intervals += [Interval(name, figure, *map(float, numbers)) for figure, *numbers in each]
     return Uncertainty(sigma, tuple(intervals), table)
+
+
+def _figures_drawn(
+    max_shear: Float32Array, spacing_mm: FloatArray, measured: Mapping[str, BoolArray], volumes_ml: Sequence[float],
+    to_bone_mm: Float32Array, table: ErrorTable, seed: int,
+) -> FloatArray:  # fmt: skip
+    """Figures of each tissue (tissues, draws, figures) in the truths drawn for some of their voxels."""
+    body = np.any(list(measured.values()), axis=0)
+    apart = _voxels_apart(body, table.correlation_mm / _STEPS_OF_VOXELS / spacing_mm)
+    at = [_some_of(where, apart) for where in measured.values()]
+    every = tuple(np.concatenate(axis) for axis in zip(*at, strict=True))
+    ends = np.cumsum([len(some[0]) for some in at])
+    tissue = np.repeat(list(measured), np.diff(ends, prepend=0)).tolist()
+    points, shear = np.stack(every, axis=1) * spacing_mm, max_shear[every].astype(np.float64)
+    draws = TruthDraws(points, shear, tissue, to_bone_mm[every], table, seed, np.array(apart) * spacing_mm)
+    drawn = []
+    for _ in range(_DRAWS):
+        truths = np.split(draws.drawn(), ends[:-1])
+        drawn.append([figures_of(truth, volume) for truth, volume in zip(truths, volumes_ml, strict=True)])
+    return np.swapaxes(drawn, 0, 1)
 
 
 def _voxels_apart(body: BoolArray, about: FloatArray) -> list[int]:

@@ -136,7 +136,8 @@ def compare(
 def _at_once(loads: int) -> int:
     """Number of loads that are compared at the same time with the available cores and memory."""
     memory = usable_memory_bytes()
-    return max(1, min(loads, usable_cores(), loads if memory is None else memory // _BYTES_OF_A_LOAD))
+    fit = loads if memory is None else memory // _BYTES_OF_A_LOAD - 1  # this process takes as much as one of them
+    return max(1, min(loads, usable_cores(), fit))
 
 
 def _axes(normal: Sequence[float], shear: Sequence[float]) -> FloatArray:

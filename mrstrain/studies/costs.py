@@ -36,7 +36,7 @@ _COMPARE_S, _MODEL_S = 8.0, 4.0
 # .84.
 _REGISTER_GIB = 0.65
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
-_OTHER_GIB = 1.5
+_COMPARE_GIB, _OTHER_GIB = 1.0, 1.5  # a comparison: of it, and of each of its processes
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
 _SHAPE = 0.1  # volume of a cell over its edge cubed, typical of the meshes
 _LEAST_CELLS = 0.9 * _CELLS  # thin tissues get shorter edges than requested
@@ -95,6 +95,8 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
     if stage.kind in ("simulate", "drive"):
         times = _ELEMENT_GIB[study.models.element if stage.kind == "simulate" else "P1"]
         return _SIMULATE_GIB + times * _SIMULATE_GIB_PER_CELL * cells
+    if stage.kind == "compare":
+        return _COMPARE_GIB * (1 + min(len(study.loads), usable_cores()))
     return _OTHER_GIB
 
 

@@ -119,8 +119,11 @@ def _table(along: Sequence[FloatArray], shape: Sequence[int], spacing_mm: FloatA
 
 def stored() -> bool:
     """Whether a run on this machine has compiled and stored these loops before, or none can be stored."""
-    place = _product.stats.cache_path
-    return place is None or any(Path(place).glob(f"{__name__.rpartition('.')[2]}._product-*.nbi"))
+    place, source, first = _product.stats.cache_path, Path(__file__), _product.py_func.__code__.co_firstlineno
+    if place is None:
+        return True
+    index = Path(place).glob(f"{source.stem}._product-{first}.*.nbi")  # numba's name of it
+    return any(file.stat().st_mtime > source.stat().st_mtime for file in index)
 
 
 # The sweeps: planes, rows and lines of the grid, one axis of B-splines after the other.
