@@ -222,6 +222,10 @@ def test_study_files_of_the_pages_can_be_read(tmp_path: Path) -> None:
         assert read_study(tmp_path / f"{number}.toml").loads
 
 
+def test_the_page_shows_the_quick_parameters_that_the_tests_use() -> None:
+    assert f"```text{QUICK}```" in (DOCS / "tutorials" / "register.md").read_text()
+
+
 def anchors(page: Path) -> set[str]:
     """Of the headings of a page, as the site and the repository's host make them."""
     whole = re.sub(r'^--8<-- "([^":]+)"$', lambda part: (ROOT / part[1]).read_text(), page.read_text(), flags=re.M)
