@@ -147,7 +147,8 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
         for r in regions
         if r.quantity == "max_shear"
     )
-    return Table("Maximum shear strain", ("tissue", "median", "95th percentile"), rows)
+    note = "In brackets: 95 % interval, from the error model." if known else ""
+    return Table("Maximum shear strain", ("tissue", "median", "95th percentile"), rows, note)
 
 
 def error_tables(bars: ErrorBars) -> list[Table]:

@@ -117,6 +117,13 @@ def test_verdict_stands_before_all_else_and_in_words(html: str) -> None:
     assert "Trust</span>" not in contents.replace("Do not trust", "")  # what is sound needs no mark there
 
 
+def test_a_verdict_without_reasons_says_once_what_it_means(tmp_path: Path) -> None:
+    write_report(tmp_path / "r.html", "A heel", TRUST, [Section("Load1", TRUST)], (), {})
+    page = (tmp_path / "r.html").read_text()
+    assert page.count('class="verdict trust"') == page.count("No check speaks against the measurement") == 1
+    assert page.count('<span class="pill trust">Trust</span>') == 1
+
+
 def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_path: Path) -> None:
     sections = [Section("Load1"), Section("Load1, cell by cell", folded=True)]
     write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {"command": "register"})
