@@ -69,10 +69,11 @@ def error_bars(
     Error bars that do not hold in the pair's twin are made wider.
     """
     grid = maps.grid
+    larger = _larger_voxel(found)
     bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
     try:
         chosen = _model_for(found, model)
-        table = chosen.table_for(_larger_voxel(found), snr)
+        table = chosen.table_for(larger, snr)
         if not bone.any():
             raise InputError("The error model needs the distance to bone, but no bone was given.")
     except InputError as reason:
@@ -87,9 +88,10 @@ def error_bars(
     wider = {row.region: row.factor for row in rows if row.factor is not None and row.factor > 1.0}
     sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
-    voxel = " x ".join(f"{s:.2g}" for s in table.spacing_mm)
+    voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
+    other = "" if own == voxel else f" (these images: voxels of {own} mm)"
     told = (
-        f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}: "
+        f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
         f"{chosen.source}. Tissues with their own figures: {known or 'none'}; all others use the pooled figures of "
         f"soft tissue. {_held(table)} The model applies to tissue that is strained and imaged like these phantoms."
     )

@@ -113,6 +113,15 @@ def test_a_muscle_named_after_a_bone_is_no_bone() -> None:
     assert {i.region for i in bars.uncertainty.intervals} == {"Tibialis posterior", "ankle fat"}
 
 
+def test_a_model_of_other_voxels_says_so() -> None:
+    found, subject, maps = given()
+    own = " x ".join(f"{edge:.2g}" for edge in GRID.spacing_mm)
+    assert "these images" not in bars_of(found, subject, maps, model()).told
+    tables = [replace(t, spacing_mm=tuple(1.3 * edge for edge in t.spacing_mm)) for t in model().tables]
+    told = bars_of(found, subject, maps, replace(model(), tables=tuple(tables))).told
+    assert f"(these images: voxels of {own} mm)" in told
+
+
 def test_the_noisier_image_counts() -> None:
     found, subject, maps = given()
     random = np.random.default_rng(1)
