@@ -160,10 +160,12 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
     known = {name.casefold(): name for name in source.at_nodes}
     name = next((known[wanted] for wanted in _NAMES if wanted in known), None)
     if name is None:
-        raise InputError(
-            f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}. Name "
-            f"the array {_NAMES[1]!r}; its unit must be that of the coordinates."
-        )
+        has = f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}."
+        if place.suffix.lower() == ".xplt":
+            raise InputError(
+                f'{has} Add <var type="displacement"/> to the <plotfile> of the FEBio model, and run it again.'
+            )
+        raise InputError(f"{has} Name the array {_NAMES[1]!r}; its unit must be that of the coordinates.")
     values = source.at_nodes[name]
     if values.shape != source.points_mm.shape:
         raise InputError(f"{place}: the array '{name}' has shape {values.shape}; three components per node are needed.")

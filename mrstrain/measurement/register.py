@@ -65,6 +65,13 @@ def register(
     refuse_touching_inputs(target, cases, [load0, *paths, *given])
     align = registration.align
     if align == "bone" and subject_files.bone is None and subject_files.bone_label is None:
+        if subject_files.labels is not None:
+            raise InputError(
+                "The images are aligned on a rigid bone, and none is given.\n"
+                f"Name the label of the bone in {subject_files.labels.name}, or pass a mask of it: bone_label or bone "
+                "(--bone-label, --bone).\n"
+                "If the images show no bone, use align image (--align image)."
+            )
         raise InputError(
             "The images are aligned on a rigid bone, and none is given.\n"
             f"In ITK-SNAP or 3D Slicer, segment the bone of the body part (in a heel, the calcaneus) on {load0.name}, "

@@ -123,7 +123,8 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
     if len(frames) != 1 or frames[0] not in ("LPS", "RAS"):
         raise ImageFileError(
             f"{place}: the frame of the components must be LPS or RAS, without contradiction; found "
-            f"{frames or 'none'}. Pass frame=, or set 'frame' in the JSON file of the same name."
+            f"{frames or 'none'}. Pass frame (--frame on the command line), or set 'frame' in the JSON file of the "
+            "same name."
         )
     infinite = np.isinf(values).any(axis=-1)
     if infinite.any():

@@ -113,6 +113,8 @@ def test_the_bone_may_be_a_label_of_the_map(spy, scans, tmp_path, tiny_pair):
     register(scans / "Load0.nii.gz", [scans / "Load1.nii.gz"], bone_label="bone", **given)
     (bone,) = spy.bones
     np.testing.assert_array_equal(bone.inside, tiny_pair.bone.inside)
+    with pytest.raises(InputError, match=r"Name the label of the bone in tissues\.nrrd"):
+        register(scans / "Load0.nii.gz", [scans / "Load1.nii.gz"], **given)
     with pytest.raises(InputError, match="calcaneum"):
         register(scans / "Load0.nii.gz", [scans / "Load1.nii.gz"], bone_label="calcaneum", **given)
     with pytest.raises(InputError, match="given twice"):
