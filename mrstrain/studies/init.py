@@ -76,6 +76,7 @@ class NewStudy:
         found = self.inputs
         lines = [f"Load0: {found.load0 or 'NOT FOUND'}", f"Loads: {', '.join(found.loads.values()) or 'NONE FOUND'}"]
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
+        lines += [f"Mask of the bone: {found.bone_mask}"] if found.bone_mask else []
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
         file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)

@@ -107,8 +107,8 @@ def accuracy(
     at_once = max(1, min(workers or usable_cores(), len(missing)))
     if tell_plan is not None:
         tell_plan(
-            f"{len(missing)} registrations to run ({len(wanted) - len(missing)} are already done): about "
-            f"{expected_minutes(missing, at_once):.0f} minutes with {at_once} at a time."
+            f"Registrations to run: {len(missing)}, {at_once} at a time, in about "
+            f"{expected_minutes(missing, at_once):.0f} min; already done: {len(wanted) - len(missing)}."
         )
     failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
     if not runs:

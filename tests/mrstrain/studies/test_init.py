@@ -43,6 +43,7 @@ def test_what_has_no_role_is_told_and_stands_in_the_study_file(tmp_path):
     assert study.study.name == 'S07 "left" \U0001f9b6'
     assert (study.images.labels, study.images.bone) == (Path("labels.nii.gz"), Path("calcaneus.nii.gz"))
     assert study.loads["Load1"].image == "Load1.nii.gz"
+    assert "Mask of the bone: calcaneus.nii.gz" in told
     for name, why in (
         ("tissues.nii.gz", "because labels.nii.gz is used as the label map"),
         ("other-bone.nii.gz", "because calcaneus.nii.gz is used as the bone"),
