@@ -12,7 +12,10 @@ from mrstrain.options import modelling
 from mrstrain.options.measurement import Cores, EngineOptions, Seeded, SubjectFiles
 
 LabelMap = Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")]
-Measured = Annotated[Path, typer.Argument(help="Results folder of register, or the folder of one of its loads.")]
+Measured = Annotated[
+    Path,
+    typer.Argument(metavar="results", help="Results folder of register, or the folder of one of its loads."),
+]
 Loads = Annotated[
     list[str] | None,
     typer.Option(
@@ -99,7 +102,10 @@ def drive(
 @takes_options
 def level(
     dvc: Annotated[
-        Path, typer.Argument(help="Results folder of register, with its settings; or the unloaded image alone.")
+        Path,
+        typer.Argument(
+            metavar="results", help="Results folder of register, with its settings; or the unloaded image alone."
+        ),
     ],
     model: Annotated[Path, typer.Argument(help="Folder of a model with one file per load, as in compare.")],
     out: Out, subject_files: SubjectFiles, engine: EngineOptions, reading: modelling.ModelReading, seeded: Seeded,
