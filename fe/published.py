@@ -75,7 +75,8 @@ class MaterialSet:
                 instead = f" (nor for {' or '.join(tried[1:])}, as a substitute)" if tried[1:] else ""
                 raise InputError(
                     f"The material set {self.name} has no material for the region '{region}'{instead}; it has "
-                    f"{', '.join(self.materials)}. Write your own set with this tissue (.toml), or rename the region."
+                    f"{', '.join(self.materials)}. Write your own set with this tissue (.toml), or rename the "
+                    "region. If it is a bone, name it among the bones of the mesh."
                 )
             by_region[region] = known[name.casefold()]
             if name != region:
