@@ -82,12 +82,17 @@ class Comparison:
             nothing = areas.pop(NOTHING)
             levelled = {name: a for name, a in areas.items() if name.endswith(LEVELLED)}
             ranked = sorted((a for name, a in areas.items() if name not in levelled), key=lambda a: a.best_ml)
-            lines.append(f"{load}: area between strain-volume curves, mL, best first: {_listed(ranked, nothing)}")
+            informative = load not in self.ranking.uninformative
+            listed = _listed(ranked, nothing, informative)
+            order = "best first" if informative else "not informative"
+            lines.append(f"{load}: area between strain-volume curves, mL, {order}: {listed}")
             for name, area in levelled.items():
                 before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
                 lines.append(f"{load}: {name} {area.ml:.2f} as measured; {before:.2f} without levelling")
         if len(self.coverage_ml) > 1 and self.ranking.areas:
-            lines.append(f"All loads: {_listed(self.ranking.areas, self.ranking.nothing)}")
+            informative = ALL_LOADS not in self.ranking.uninformative
+            listed = _listed(self.ranking.areas, self.ranking.nothing, informative)
+            lines.append(f"All loads{'' if informative else ' (not informative)'}: {listed}")
         return [*lines, *self.ranking.statements, *self.notes]
 
     def __str__(self) -> str:
@@ -185,7 +190,7 @@ class Comparison:
         own: dict[str, object] = {
             "total_area_ml": {a.model: a.best_ml for a in ranking.areas}, "told_apart": list(ranking.statements),
             "not_told_apart": ranking.not_distinguishable, "notes": list(self.notes), "coverage_ml": self.coverage_ml,
-            "verdict": _plain(self.verdict),
+            "not_informative": list(ranking.uninformative), "verdict": _plain(self.verdict),
             "verdict_by_load": {load: _plain(verdict) for load, verdict in self.verdicts.items()},
         }  # fmt: skip
         write_json(target / tables.RECORD, own | about)
@@ -210,7 +215,8 @@ class Comparison:
             pairs = {load: tuple((a, b) for a, b in of) for load, of in content["not_told_apart"].items()}
             verdicts = {load: _verdict(of) for load, of in content["verdict_by_load"].items()}
             *totals, nothing = (a for a in areas if a.load == ALL_LOADS)
-            ranking = Ranking(tuple(totals), nothing, tuple(content["told_apart"]), pairs)
+            few = tuple(content.get("not_informative", ()))  # older records do not tell
+            ranking = Ranking(tuple(totals), nothing, tuple(content["told_apart"]), pairs, few)
             coverage, verdict, notes = content["coverage_ml"], _verdict(content["verdict"]), tuple(content["notes"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{place / tables.RECORD} is not a valid record of a comparison ({error}).") from error
@@ -341,8 +347,8 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
     return notes
 
 
-def _listed(areas: Sequence[Area], nothing: Area) -> str:
-    worse = ", ".join(no_nearer(areas, nothing))
+def _listed(areas: Sequence[Area], nothing: Area, informative: bool) -> str:
+    worse = ", ".join(no_nearer(areas, nothing)) if informative else ""
     listed = ", ".join(f"{a.model} {shown(a)}" for a in areas)
     return listed + (f"; no better than {NOTHING} ({shown(nothing)}): {worse}" if worse else "")
 

@@ -33,17 +33,20 @@ class Ranking:
         The best match and the significant differences, over all loads, then under each load.
     not_distinguishable : mapping of load to Pairs
         Pairs whose areas do not differ significantly; those over all loads under `ALL_LOADS`.
+    uninformative : tuple of str
+        Loads under which hardly any tissue is strained within the range of the areas, and `ALL_LOADS` if all are such.
     """
 
     areas: tuple[Area, ...]
     nothing: Area
     statements: tuple[str, ...]
     not_distinguishable: Mapping[str, Pairs]
+    uninformative: tuple[str, ...] = ()
 
     def rank(self, model: str) -> tuple[int, int] | None:
-        """First and last rank over all loads that a model may have; None for one that is not ranked."""
+        """First and last rank over all loads that a model may have; None for one, or where none, is ranked."""
         names = [a.model for a in self.areas if not a.levelled]
-        if model not in names:
+        if model not in names or ALL_LOADS in self.uninformative:
             return None
         rank, pairs = 1 + names.index(model), self.not_distinguishable[ALL_LOADS]
         return rank - sum(b == model for _, b in pairs), rank + sum(a == model for a, _ in pairs)
@@ -66,7 +69,9 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     nothing = rows.pop()
     rows.sort(key=lambda a: (a.levelled, a.best_ml))
     ranked = [a for a in rows if not a.levelled]
-    informative = None if all(one.hardly_strained for one in loads) else band
+    uninformative = [one.load for one in loads if one.hardly_strained]
+    uninformative += [ALL_LOADS] * (len(uninformative) == len(loads))
+    informative = None if ALL_LOADS in uninformative else band
     pairs = {ALL_LOADS: _pairs(ranked, informative)}
     pairs |= {one.load: _pairs(one.ranked(), None if one.hardly_strained else one.bands.get(ALL)) for one in loads}
     statements = [_under(one, pairs[one.load]) for one in loads]
@@ -75,7 +80,7 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
         caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
         caveat *= bool(distrusted)
         statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat))
-    return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs)
+    return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs, tuple(uninformative))
 
 
 def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:

@@ -154,7 +154,8 @@ def drawings_of_all(
     pages = [strip.max_shear[name] for strip in strips for name in (MEASURED, model) if name in strip.max_shear]
     known = np.concatenate([page[np.isfinite(page)] for page in pages])
     highest = max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
-    best = "the best match over all loads" if ranking.areas else "a model"
+    informative = ranking.areas and ALL_LOADS not in ranking.uninformative
+    best = "the best match over all loads" if informative else "a model"
     note = f"Lower row: {model}, {best}. {strips[0].title}, through the lowest point of the bone."
     slices, of_all = (strips, model, highest), [curve for curve in curves if curve.tissue == ALL]
     return {
@@ -197,7 +198,8 @@ def shown(area: Area) -> str:
 def _ranks(ranking: Ranking, model: str) -> str:
     """Rank of a model over all loads: a range if not distinguishable from neighbours, a dash if not ranked."""
     ranks = "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
-    return ranks + f", no better than {NOTHING}" * (model in no_nearer(ranking.areas, ranking.nothing))
+    worse = ALL_LOADS not in ranking.uninformative and model in no_nearer(ranking.areas, ranking.nothing)
+    return ranks + f", no better than {NOTHING}" * worse
 
 
 def area_rows(areas: Iterable[Area], ranking: Ranking, loads: Sequence[str]) -> list[tuple[str, ...]]:

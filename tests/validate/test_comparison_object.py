@@ -124,6 +124,17 @@ def test_the_headline_is_the_best_match_or_the_area_of_the_best(comparison: Comp
     assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: area between strain-volume curves ")
 
 
+def test_a_load_whose_area_is_not_informative_has_no_best_model(comparison: Comparison) -> None:
+    load, model = next(iter(comparison.coverage_ml)), comparison.ranking.areas[0].model
+    line = next(line for line in comparison.summary() if line.startswith(f"{load}: area"))
+    assert ", best first: " in line
+    ranking = replace(comparison.ranking, uninformative=(load, "all loads"))
+    doubtful = replace(comparison, ranking=ranking)
+    line = next(line for line in doubtful.summary() if line.startswith(f"{load}: area"))
+    assert f", not informative: {model} " in line
+    assert not any("no better than" in line or "best first" in line for line in doubtful.summary() if load in line)
+
+
 def test_plots_draw_the_curves_and_areas_themselves(comparison: Comparison) -> None:
     figure = comparison.plot()
     assert [axes.get_title() for axes in figure.axes] == ["Load1", "Load2"]

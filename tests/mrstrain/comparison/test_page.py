@@ -136,6 +136,9 @@ def test_a_load_that_hardly_strains_does_not_judge_and_a_total_is_a_mean_of_shar
     informative, second = [s for s in ranking.statements if "under Load" in s or s.startswith("Load")]
     assert informative == "Load1: less than 1 % of the tissue exceeds 0.2, so the area metric is not informative."
     assert second.startswith("Best match under Load2")
+    assert ranking.uninformative == ("Load1",)
+    alone = rank_over_loads([weak])
+    assert (alone.uninformative, alone.rank("a")) == (("Load1", "all loads"), None)
     areas = {(a.model, a.load): a for one in (weak, strong) for a in one.areas if a.tissue == ALL}
     for row in (*ranking.areas, ranking.nothing):
         parts = [areas[row.model, load] for load in ("Load1", "Load2")]
