@@ -35,7 +35,8 @@ def test_the_page_shows_every_example_with_its_picture() -> None:
     page = (DOCS / "gallery.md").read_text()
     for example in EXAMPLES:
         assert "\nassert " in example.read_text(), example
-        assert f"\n--8<--\ndocs/gallery/{example.name}\n--8<--\n" in page, example
+        code = example.read_text()
+        assert f"\n```python\n{code.rstrip()}\n```\n" in page, f"Copy {example} into docs/gallery.md."
         assert f"(images/gallery/{example.stem}.webp)" in page, example
         assert (DOCS / "images" / "gallery" / f"{example.stem}.webp").stat().st_size < MOST_BYTES
 

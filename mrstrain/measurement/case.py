@@ -1,9 +1,9 @@
 """Loads that were measured and written: each a case, together a series with its report."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from dvc import Measurement, Verdict
 from dvc.atomic_files import write_json
@@ -20,11 +20,14 @@ class Case:
     section: Section
     lines: tuple[str, ...]
     headline: str
+    voxels: str = ""
+    """Number and size of the voxels of its maps, in words."""
 
     @classmethod
     def of(cls, measurement: Measurement, folder: Path, record: Mapping[str, object]) -> Self:
         """Write a measurement, with its provenance; its folder is there whole or not at all."""
-        return cls(folder, measurement.write(folder, record), tuple(measurement.summary()), measurement.headline)
+        section, voxels = measurement.write(folder, record), str(measurement.maps.grid).partition(", box")[0]
+        return cls(folder, section, tuple(measurement.summary()), measurement.headline, voxels)
 
     @property
     def name(self) -> str:
@@ -90,7 +93,8 @@ class Series:
         verdict = worst([s.verdict for s in told if s.verdict is not None])
         write_json(out / PROVENANCE, record)
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
-        write_report(out / REPORT, "Strain from MR image pairs", verdict, told, closing, record_lines(record))
+        title, about = "Strain from MR image pairs", _images(record, cases)
+        write_report(out / REPORT, title, verdict, told, closing, record_lines(record), notes=about)
         return cls(out, cases, failures)
 
     @property
@@ -103,3 +107,11 @@ class Series:
         lines = [line for case in self.cases for line in case.summary()]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
         return [*lines, f"Report: {self.out / REPORT}"]
+
+
+def _images(record: Mapping[str, Any], cases: Sequence[Case]) -> list[str]:
+    """Which images a report is about, in a line, as far as its record tells."""
+    inputs = record.get("inputs", {})
+    names = ", ".join(file["name"] for role in ("load0", "loads", "repeat") for file in inputs.get(role, ()))
+    voxels = next((case.voxels for case in cases if case.voxels), "")
+    return [f"Images: {names}. Maps of {voxels}."] if names and voxels else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -94,6 +95,12 @@ PROMISED = [
 def test_every_promised_file_is_there(results, study, name):
     assert not results.failures
     assert (study / "out" / "Load1" / name).stat().st_size > 0
+
+
+def test_the_report_says_which_images_it_is_about(results, study, tiny_pair):
+    page = (study / "out" / "report.html").read_text()
+    voxels = str(tiny_pair.reference.grid).partition(", box")[0]
+    assert re.search(rf"<p>Images: [^<]*Load0[^<]*, [^<]*Load1[^<]*\. Maps of {voxels}\.</p>", page)
 
 
 def test_error_bars_are_those_of_the_model(results, study, tiny_pair):
