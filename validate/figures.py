@@ -15,7 +15,7 @@ from dvc import Deformation
 from dvc.arrays import FloatArray
 from dvc.report.chart import chart, label_axes, legend, panels, shared_bar
 from dvc.report.drawing import Columns
-from dvc.report.style import BAND, INK, RULE, WIDTH_IN, Look, looks
+from dvc.report.style import BAND, INK, WIDTH_IN, Look, looks
 from fe import published_names
 from fe.figures import Slice, slice_sheet
 from validate.curves import Area
@@ -40,8 +40,8 @@ def model_looks(models: Iterable[str]) -> dict[str, Look]:
 def volume_strain(one: LoadComparison, tissues: Sequence[str], models: Sequence[str]) -> Figure:
     """Volume of tissue in which the maximum shear strain exceeds a value: measured (black) and models, same cells.
 
-    The grey band contains the true curve in 95 % of cases, according to the error model of the measurement. Areas are
-    computed between the dotted lines.
+    A grey band, where the error is known, contains the true curve in 95 % of cases. Areas are computed between the
+    dotted lines.
     """
     curves = curves_of(one, np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS))
     return _curves([c for c in curves if c.tissue in tissues], "tissue", one.criteria.strains, models)
@@ -63,7 +63,7 @@ def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], mode
             how = {"color": "black", "linewidth": 2.4} if name == "measured" else look[name].line
             axes.plot(at, of[name].volume_above_ml, label=name, **how)
         for edge in strains:
-            axes.axvline(edge, color=RULE, linewidth=0.9, linestyle=":")
+            axes.axvline(edge, color=INK, linewidth=1.1, linestyle=":")
         axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
         label_axes(axes, _MAX_SHEAR, "volume above this strain, mL", title)
     legend(spots[0])
@@ -73,7 +73,8 @@ def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], mode
 def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Figure:
     """Strain-volume curves of one tissue, measured (black) and simulated, one panel for each load.
 
-    The grey band contains the true curve in 95 % of cases. Areas are computed between the dotted lines.
+    A grey band, where the error is known, contains the true curve in 95 % of cases. Areas are computed between the
+    dotted lines.
     """
     models = [name for name in dict.fromkeys(c.field for c in curves) if name not in ("measured", LOWER, UPPER)]
     return _curves(curves, "load", strains, models)
