@@ -350,7 +350,7 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
 def _listed(areas: Sequence[Area], nothing: Area, informative: bool) -> str:
     worse = ", ".join(no_nearer(areas, nothing)) if informative else ""
     listed = ", ".join(f"{a.model} {shown(a)}" for a in areas)
-    return listed + (f"; no better than {NOTHING} ({shown(nothing)}): {worse}" if worse else "")
+    return listed + (f"; no better than {NOTHING}, {shown(nothing)}: {worse}" if worse else "")
 
 
 def _plain(verdict: Verdict | None) -> dict[str, object] | None:

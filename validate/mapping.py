@@ -113,8 +113,8 @@ def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
     known = labels.names.values()
     if missing := [name for name in bones if name not in known]:
         raise InputError(
-            f"The label map has no label '{missing[0]}'; its labels are {', '.join(known)}. Check the names of the "
-            "bones and the table of label names."
+            f"The label map has no label '{missing[0]}'; its labels are {', '.join(known)}. Name its "
+            "bones (bones, --bone), and check the table of label names."
         )
 
 

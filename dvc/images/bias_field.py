@@ -21,8 +21,8 @@ _ITERATIONS = [50, 50, 50]
 def without_bias_field(images: Sequence[Image], threads: int = 1) -> list[Image]:
     """Images, above their lowest value, divided by their bias fields, estimated by N4 on coarse copies.
 
-    So many at once as there are threads; the result is the same bit for bit on any number of them. The first is that of
-    a series, the unloaded one: it is kept until another comes, and not corrected again for the next load.
+    As many at once as there are threads; the result is the same bit for bit on any number of them. The first image, the
+    unloaded one of a series, is kept in corrected form, so that the next load need not correct it again.
 
     Normalised correlation over the whole body takes a bias field for contrast, and a B-spline then bends tissue to
     follow it: on a phantom with fields of +-20 % that tripled the strain error. Only the registration sees the
@@ -39,17 +39,18 @@ def without_bias_field(images: Sequence[Image], threads: int = 1) -> list[Image]
         sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
 
 
-_first: dict[bytes, Image] = {}
+_kept: dict[bytes, Image] = {}  # the last first image in corrected form, by the hash of its contents
 
 
 def _first_corrected(image: Image) -> Image:
     contents = sha256(np.ascontiguousarray(image.values).data)
     contents.update(image.grid.affine.tobytes())
-    if contents.digest() not in _first:
-        found = _corrected(image)
-        _first.clear()
-        _first[contents.digest()] = found
-    return _first[contents.digest()]
+    corrected = _kept.get(contents.digest())
+    if corrected is None:
+        corrected = _corrected(image)
+        _kept.clear()
+        _kept[contents.digest()] = corrected
+    return corrected
 
 
 def _corrected(image: Image) -> Image:

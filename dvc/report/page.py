@@ -32,7 +32,7 @@ _TONES: Mapping[Level | None, tuple[str, str]] = {
 }  # fmt: skip
 """Colours of a notebook's headline and its ground, by the level of the verdict in it."""
 _GREYS, _COLOURS = 32, 125  # steps of a volume's values: each takes room, of noise above all
-_QUALITY = 66  # of pictures on the page; files of figures lose nothing
+_QUALITY = 58  # of pictures on the page; files of figures lose nothing
 _SMALL = 100_000  # bytes of a PNG: a chart, which is smaller yet without loss
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"

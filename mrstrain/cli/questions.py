@@ -1,8 +1,9 @@
 """What `init` asks in a terminal: the bone, the forces, the plate's directions. Enter skips a question."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import typer
 
@@ -11,7 +12,6 @@ from mrstrain.studies.init import Answers, StudyInputs
 
 Read = Callable[[str], str]
 _T = TypeVar("_T")
-_NORMAL, _SHEAR = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
 
 
 def ask(inputs: StudyInputs, names: Sequence[str], picture: Path | str, *, read: Read = input) -> Answers:
@@ -21,25 +21,25 @@ def ask(inputs: StudyInputs, names: Sequence[str], picture: Path | str, *, read:
     """
     typer.echo(f"Picture of what was found: {picture}")
     typer.echo("Enter keeps what is in brackets, or leaves it to be filled in later.")
-    given: dict[str, object] = {}
+    given: dict[str, Any] = {}
+    usual = Answers()
     try:
         given |= _bone(inputs, names, read)
         forces: dict[str, tuple[float, float]] = {}
         given["forces"] = forces
         for load in inputs.loads:
-            normal = _asked(f"{load}: normal force, N", "later", _force, read)
-            if normal is not None:
-                forces[load] = normal, _asked(f"{load}: shear force, N", "0", _number, read) or 0.0
+            pressed = _asked(f"{load}: normal force, N", "later", _force, read)
+            if pressed is not None:
+                forces[load] = pressed, _asked(f"{load}: shear force, N", "0", _number, read) or 0.0
         if inputs.loads:
-            given["normal"] = _asked(
-                "Plate: outward normal, away from the body, LPS", _words(_NORMAL), _direction, read
-            )
+            normal = "Plate: outward normal, away from the body, LPS"
+            given["normal"] = _asked(normal, _words(usual.normal), _direction, read)
         if any(shear for _, shear in forces.values()):
             shear = "Plate: direction of the shear force on the tissue, LPS"
-            given["shear_direction"] = _asked(shear, _words(_SHEAR), _direction, read)
+            given["shear_direction"] = _asked(shear, _words(usual.shear_direction), _direction, read)
     except EOFError:
         typer.echo("")
-    return Answers(**given)  # type: ignore[arg-type]
+    return replace(usual, **{name: answer for name, answer in given.items() if answer is not None})
 
 
 def _bone(inputs: StudyInputs, names: Sequence[str], read: Read) -> dict[str, object]:

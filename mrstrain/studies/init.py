@@ -15,6 +15,7 @@ from dvc.io.images.dicom import is_dicom, is_multiframe
 from fe import published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.simulate import LOADS
+from mrstrain.options.modelling import Directions
 from mrstrain.records.inputs import IMAGE_ENDINGS, image_stem
 from mrstrain.studies.file import FILE
 
@@ -59,8 +60,8 @@ class Answers:
     bone: str | None = None  # name of its label
     bone_mask: str | None = None  # or the file of a mask of it
     forces: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # normal and shear, by load
-    normal: tuple[float, float, float] | None = None  # of the plate, outward
-    shear_direction: tuple[float, float, float] | None = None
+    normal: tuple[float, float, float] = Directions().plate_normal  # of the plate, outward
+    shear_direction: tuple[float, float, float] = Directions().shear_direction
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +134,7 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
 def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
     """The picture of the images, or why there is none, and the names of the labels."""
     from dvc.report.drawing import png_bytes
-    from mrstrain.studies.picture import Outlined, overview
+    from mrstrain.studies.picture import Labelled, overview
 
     try:
         if found.load0 is None:
@@ -145,7 +146,7 @@ def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
         others = {load: read_image(place / image, allow_missing=True) for load, image in found.loads.items()}
         names = [] if labels is None else [name for number, name in labels.names.items() if number != 0]
         with whole_file(place / PICTURE) as file:
-            file.write_bytes(png_bytes(overview(Outlined.of(unloaded, labels), others)))
+            file.write_bytes(png_bytes(overview(Labelled.of(unloaded, labels), others)))
     except InputError as error:
         return f"none, {error}", []
     return place / PICTURE, names

@@ -123,7 +123,7 @@ def test_shading_is_removed_whatever_the_images_zero(offset):
 def test_the_unloaded_image_of_a_series_is_corrected_once(monkeypatch):
     counted = []
     correct = bias_field._corrected
-    monkeypatch.setattr(bias_field, "_first", {})
+    monkeypatch.setattr(bias_field, "_kept", {})
     monkeypatch.setattr(bias_field, "_corrected", lambda image: counted.append(image) or correct(image))
     random = np.random.default_rng(8)
     grid = Grid((16, 16, 16), np.full(3, 2.0), np.zeros(3))

@@ -23,7 +23,7 @@ from mrstrain.cli.questions import ask
 from mrstrain.studies.check import check
 from mrstrain.studies.file import Load, Study, keys_of, read_study
 from mrstrain.studies.init import NewStudy, init
-from mrstrain.studies.picture import Outlined
+from mrstrain.studies.picture import Labelled
 
 
 def folder_of(place: Path, *names: str) -> Path:
@@ -178,8 +178,8 @@ def test_no_picture_is_no_reason_to_write_no_study_file(tmp_path):
 
 def test_labels_that_lie_elsewhere_are_left_out_of_the_picture(tiny_pair):
     far = replace(tiny_pair.labels.grid, origin_mm=tiny_pair.labels.grid.origin_mm + 1000.0)
-    assert set(Outlined.of(tiny_pair.reference, tiny_pair.labels).regions) == set(tiny_pair.labels.names.values())
-    assert Outlined.of(tiny_pair.reference, replace(tiny_pair.labels, grid=far)).regions == {}
+    assert set(Labelled.of(tiny_pair.reference, tiny_pair.labels).regions) == set(tiny_pair.labels.names.values())
+    assert Labelled.of(tiny_pair.reference, replace(tiny_pair.labels, grid=far)).regions == {}
 
 
 def answering(*lines: str):
