@@ -176,7 +176,7 @@ def test_a_model_no_nearer_than_no_deformation_is_said_to_be_so_beside_its_rank(
         assert ranks["twice"] == ("2" if error else "1–3") + ", no better than no deformation"
         assert ranks["no deformation"] == "–"
         words = re.findall(
-            r"(\S+): area between.*; no better than no deformation \([\d.]+.*\): twice, thrice$", str(both), re.M
+            r"(\S+): area between.*; no better than no deformation, [\d.]+.*: twice, thrice$", str(both), re.M
         )
         assert words == ["Load1", "Load2"]
         assert re.search(r"^All loads: .*; no better than no deformation, .*: twice, thrice$", str(both), re.M)
