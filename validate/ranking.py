@@ -44,7 +44,7 @@ class Ranking:
     uninformative: tuple[str, ...] = ()
 
     def rank(self, model: str) -> tuple[int, int] | None:
-        """First and last rank over all loads that a model may have; None for one, or where none, is ranked."""
+        """First and last rank over all loads that a model may have; None if it is not ranked, or no model is."""
         names = [a.model for a in self.areas if not a.levelled]
         if model not in names or ALL_LOADS in self.uninformative:
             return None
