@@ -231,7 +231,7 @@ def write_report(
     scripts = {"page": _stored("page.js"), "viewer": _stored("viewer.js")}
     library = {"version": NIIVUE, "licence": _stored("niivue-LICENSE.txt"), "packed": _library()} if volumes else None
     page = _template("report").render(
-        **told, sections=sections, volumes=volumes, scripts=scripts, library=library, reload_s=reload_s
+        **told, sections=sections, volumes=volumes, scripts=scripts, library=library, reload_s=reload_s, beneath={}
     )
     write_whole(path, page)
 

@@ -12,6 +12,8 @@ document.querySelectorAll("nav a").forEach((link) => link.addEventListener("clic
   document.querySelector(link.getAttribute("href")).open = true;
 }));
 unfolded();
+/* A picture beneath others is stored once, and copied where it lies beneath more. */
+document.querySelectorAll("[data-copy]").forEach((picture) => { picture.src = document.getElementById(picture.dataset.copy).src; });
 /* Pictures on top of one another fade. */
 document.querySelectorAll(".faders").forEach((faders) => {
   const over = faders.previousElementSibling.querySelectorAll(".over");

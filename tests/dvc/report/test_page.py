@@ -202,6 +202,30 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_picture_beneath_several_is_stored_once(tmp_path: Path) -> None:
+    own = [picture_of(np.full((60, 80), shade)) for shade in (40, 90)]
+    unloaded = ("unloaded", picture_of(np.full((60, 80), 200)))
+    sections = [
+        Section(load, pictures=(Picture("Strain", "c", png(), (unloaded, ("registered", one))),))
+        for load, one in zip(("Load1", "Load2"), own, strict=True)
+    ]
+    write_report(tmp_path / "r.html", "A heel", None, sections, [], {})
+    page = Page((tmp_path / "r.html").read_text())
+    beneath = {a["alt"]: a for a in page.all("img") if not str(a["alt"]).startswith("Strain")}
+    assert beneath["unloaded, Load2"]["data-copy"] == beneath["unloaded, Load1"]["id"]
+    assert "src" not in beneath["unloaded, Load2"]
+    stored = [a["src"] for a in page.all("img") if "src" in a]
+    assert len({a["src"] for a in beneath.values() if "src" in a}) == 3
+    assert len(stored) == 5
+
+
+def picture_of(shades: np.ndarray) -> bytes:
+    """A grey picture as a PNG file's bytes."""
+    file = io.BytesIO()
+    Pixels.fromarray(shades.astype(np.uint8)).save(file, "PNG")
+    return file.getvalue()
+
+
 def test_a_picture_fades_to_those_beneath_it(tmp_path: Path) -> None:
     below = ("unloaded", png()), ("loaded, registered", png())
     pictures = (Picture("Strain", "c", png(), below), Picture("Curves", "c", png()))
