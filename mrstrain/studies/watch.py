@@ -55,16 +55,16 @@ class Report:
             "the time of day does not change any more, the run was killed; mrstrain run resumes it."
         )  # fmt: skip
         write_page_in_progress(self.path, self.study, names, outcomes, under_way, told, ended=interrupted)
-        self._show(outcomes)
+        self._show(outcomes[name] for load in self.study.loads if (name := f"register {load}") in outcomes)
 
     def whole(self) -> None:
         """Write the report when every stage has an outcome."""
         outcomes = self.pipeline.in_order()
         write_run_report(self.path, self.study, outcomes)
-        self._show(outcomes)
+        self._show(outcomes.values())
 
-    def _show(self, outcomes: Mapping[str, StageOutcome]) -> None:
-        ran = [section for one in outcomes.values() if not one.reused for section in one.result.sections]
+    def _show(self, on_page: Iterable[StageOutcome]) -> None:
+        ran = [section for one in on_page if not one.reused for section in one.result.sections]
         if self.on_report is not None and any(section.pictures for section in ran):
             self.on_report(self.path)
             self.on_report = None

@@ -145,3 +145,13 @@ def test_results_that_were_there_already_are_no_reason_to_open_a_browser(seen: S
     seen.watch.reports[""].in_progress([], 1.0)
     assert "<img" in seen.path.read_text()
     assert seen.shown == []
+
+
+def test_a_browser_opens_once_the_page_has_a_picture_and_not_before(seen: Seen) -> None:
+    seen.end("mesh", MEASURED)  # whose pictures the growing page does not show
+    seen.watch.reports[""].in_progress([], 1.0)
+    assert "<img" not in seen.path.read_text()
+    assert seen.shown == []
+    seen.end("register Load1", MEASURED)
+    seen.watch.reports[""].in_progress([], 1.0)
+    assert seen.shown == [seen.path]
