@@ -51,7 +51,7 @@ def by_elastix(fixed: Image, moving: Image, bone: Mask, start: RigidMotion, seed
 
 def one(pair: HeelPair, seed: int, noise: float) -> dict[str, object]:
     random = np.random.default_rng(seed)
-    fixed, moving = without_bias_field([noisy(image, noise, random) for image in (pair.reference, pair.loaded)])
+    fixed, moving = (without_bias_field(noisy(image, noise, random)) for image in (pair.reference, pair.loaded))
     centre = pair.bone.points().mean(axis=0)
     turn = Rotation.from_rotvec(np.radians(random.uniform(-3.0, 3.0, 3))).as_matrix()
     start = pair.foot_motion.after(RigidMotion.about(centre, turn, random.uniform(-1.5, 1.5, 3)))

@@ -46,10 +46,11 @@ class Worker(AbstractContextManager["Worker", None]):
         self._executor: ProcessPoolExecutor | None = None
         self._lock = threading.Lock()
 
-    def start(self, module: str) -> None:
-        """Start the child process and let it import a module, while the caller does something else."""
+    def start(self, *modules: str) -> None:
+        """Start the child process and let it import modules, while the caller does something else."""
         with self._lock:
-            self._running().submit(_imported, module)
+            for module in modules:
+                self._running().submit(_imported, module)
 
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
         """Run ``task(*args)`` in the child; its exceptions are raised here, and `WorkerError` if the child dies.

@@ -48,7 +48,7 @@ def write_pair(pair: HeelPair, folder: Path) -> None:
     write_labels(folder / "labels.mha", pair.labels)
     grid = _box(body)
     write_image(folder / "scan1-moved.mha", without_motion(pair.loaded, pair.foot_motion))
-    unloaded, loaded = without_bias_field([pair.reference, pair.loaded])
+    unloaded, loaded = map(without_bias_field, (pair.reference, pair.loaded))
     loaded = without_motion(loaded, pair.foot_motion)
     write_image(folder / "reference.mha", _onto(unloaded, grid, order=1))
     write_image(folder / "loaded.mha", loaded)

@@ -1,13 +1,13 @@
 """Noise of a magnitude MR image: its standard deviation, and the signal-to-noise ratio of the tissue."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
-from dvc.images.tissue import widened
+from dvc.images.tissue import tissue_mask, widened
 
 _RAYLEIGH_MEDIAN = np.sqrt(2.0 * np.log(2.0))
 _AIR_MM = 4.0
@@ -72,3 +72,23 @@ class Noise:
         sigma = _finest_differences(image, tissue) if in_air is None else in_air
         level = float(np.percentile(image.values[tissue.inside & ~image.missing], 75))
         return cls(in_air, level / sigma if sigma > 0 else float("inf"))
+
+
+def noise_of(reference: Image, loaded: Image, tissue: Mask) -> tuple[Noise, Noise | None]:
+    """The noise of both images of a pair; None for a loaded one in which no threshold finds the body.
+
+    The air of the unloaded image is what lies beside the whole body, of which the given tissue may be a part; where no
+    threshold finds that body, its noise in the air is not known.
+    """
+
+    def body_in(image: Image) -> Mask | None:
+        try:
+            return tissue_mask(image)
+        except InputError:
+            return None
+
+    seen, other = body_in(reference), body_in(loaded)
+    of_loaded = None if other is None else Noise.of(loaded, other)
+    if seen is None:
+        return replace(Noise.of(reference, tissue), in_air=None), of_loaded
+    return Noise.of(reference, tissue, Mask(reference.grid, tissue.inside | seen.inside)), of_loaded

@@ -60,20 +60,19 @@ class TwinCheck:
 
 
 def error_bars(
-    found: Registration, subject: Subject, maps: StrainMaps, snr: float, model: ErrorModel | None,
-    twin: TwinCheck | None = None,
+    found: Registration, subject: Subject, maps: StrainMaps, model: ErrorModel | None, twin: TwinCheck | None = None,
 ) -> ErrorBars:  # fmt: skip
     """Error of a registered load's maximum shear strain, by an error model, the user's own or the preset's.
 
-    ``snr`` is the lower signal-to-noise ratio of the two images (`dvc.measurement.judgement.noise_of`).
-    Error bars that do not hold in the pair's twin are made wider.
+    That model's figures are taken at the lower signal-to-noise ratio of the two images. Error bars that do not hold in
+    the pair's twin are made wider.
     """
     grid = maps.grid
     larger = _larger_voxel(found)
     bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
     try:
         chosen = _model_for(found, model)
-        table = chosen.table_for(larger, snr)
+        table = chosen.table_for(larger, min(one.snr for one in found.noise if one is not None))
         if not bone.any():
             raise InputError("The error model needs the distance to bone, but no bone was given.")
     except InputError as reason:

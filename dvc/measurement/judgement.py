@@ -8,12 +8,9 @@ import numpy as np
 from dvc.arrays import Float32Array, FloatArray
 from dvc.deformation.protocol import RigidMotion, displacement_on_grid
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
-from dvc.errors import InputError
 from dvc.images.image import Image, Mask
-from dvc.images.noise import Noise
 from dvc.images.resample import Carrier, shows
 from dvc.images.similarity import Windows, brightness_offset, local_correlation
-from dvc.images.tissue import tissue_mask
 from dvc.io import result_folder as files
 from dvc.io.images.write import write_image
 from dvc.io.transforms.write import write_displacement_as_found, write_itk_transform
@@ -77,28 +74,7 @@ def maps_of(found: Registration) -> StrainMaps:
     return strain_maps(found.deformation, found.tissue, lambda x: shows(loaded, motion.apply(x), edge))
 
 
-def noise_of(found: Registration) -> tuple[Noise, Noise | None]:
-    """The noise of both images; None for a loaded one in which no threshold finds the body.
-
-    The air of the unloaded image is what lies beside the whole body, of which the given tissue may be a part; where no
-    threshold finds that body, its noise in the air is not known.
-    """
-
-    def body_in(image: Image) -> Mask | None:
-        try:
-            return tissue_mask(image)
-        except InputError:
-            return None
-
-    seen, loaded = body_in(found.reference), body_in(found.loaded)
-    of_loaded = None if loaded is None else Noise.of(found.loaded, loaded)
-    if seen is None:
-        return replace(Noise.of(found.reference, found.tissue), in_air=None), of_loaded
-    body = Mask(found.reference.grid, found.tissue.inside | seen.inside)
-    return Noise.of(found.reference, found.tissue, body), of_loaded
-
-
-def carried_images(found: Registration, noise: tuple[Noise, Noise | None]) -> CarriedImages:
+def carried_images(found: Registration) -> CarriedImages:
     """Carry the loaded image to the unloaded one, and compare them."""
     reference, motion, grid = found.reference, found.alignment.motion, found.reference.grid
     loaded = Carrier(found.loaded)
@@ -115,7 +91,7 @@ def carried_images(found: Registration, noise: tuple[Noise, Noise | None]) -> Ca
     local_rigid, pooled_rigid = windows.correlation(unloaded, rigid)
     local_after, pooled_after = windows.correlation(unloaded, after)
     similarity = Similarity((as_scanned, pooled_rigid, pooled_after))
-    in_air = [None if one is None else one.in_air for one in noise]
+    in_air = [None if one is None else one.in_air for one in found.noise]
     if in_air[0] is not None and in_air[1] is not None:
         possible = windows.most_similarity(unloaded, after, (in_air[0], in_air[1]))
         similarity = replace(similarity, possible=possible)

@@ -110,12 +110,11 @@ class Measurement:
         With ``is_repeat`` the loaded image is a repeat scan without load; its strain is the noise floor.
         """
         more = evidence or Evidence()
-        # On two cores, as NumPy and SciPy let go of the interpreter; of two at work, only one calls compiled kernels.
+        # On two cores, as NumPy, SciPy and compiled loops let go of the interpreter.
         with ThreadPoolExecutor(1) as pool:
-            strain, noise = pool.submit(judgement.maps_of, found), judgement.noise_of(found)
-            snr, maps = min(one.snr for one in noise if one is not None), strain.result()
-            drawn = pool.submit(error_bars, found, subject, maps, snr, more.error_model, more.twin)
-            images, bars = judgement.carried_images(found, noise), drawn.result()
+            carried = pool.submit(judgement.carried_images, found)
+            maps = judgement.maps_of(found)
+            bars, images = error_bars(found, subject, maps, more.error_model, more.twin), carried.result()
         if is_repeat:
             more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
         quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)

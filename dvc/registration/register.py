@@ -23,6 +23,7 @@ from dvc.deformation.protocol import Composed, Deformation, RigidMotion, Within
 from dvc.errors import InputError, ParameterError
 from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Image, LabelMap, Mask
+from dvc.images.noise import Noise, noise_of
 from dvc.images.tissue import tissue_mask
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
@@ -98,6 +99,8 @@ class Registration:
         As used.
     seconds : float
         Wall time.
+    noise : (Noise, Noise or None)
+        Of the reference and of the loaded image (`dvc.images.noise.noise_of`).
     choice : Regularisation
         The regularisation weights that the engine used, and why.
     unlike_study : str
@@ -112,6 +115,7 @@ class Registration:
     displacement: Displacement
     settings: Settings
     seconds: float
+    noise: tuple[Noise, Noise | None]
     choice: Regularisation = field(default_factory=Regularisation)
     unlike_study: str = ""
 
@@ -171,6 +175,7 @@ def register(
     own = Worker(chosen.threads) if worker is None else nullcontext(worker)
     with own as runner, ThreadPoolExecutor(1) as beside:
         beside.submit(engine.prepare)
+        noise = beside.submit(noise_of, reference, loaded, body)
         pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
         guess = start
         if isinstance(start, BSpline):  # and remains one
@@ -181,7 +186,7 @@ def register(
         found = engine.find(pair, start=guess, seeds=_seeds(chosen)[1:], worker=runner, progress=tell)
     return Registration(
         reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,
-        time.monotonic() - began, found.choice, found.unlike_study,
+        time.monotonic() - began, noise.result(), found.choice, found.unlike_study,
     )  # fmt: skip
 
 
@@ -201,9 +206,7 @@ def _aligned(
         return replace(scan, grid=scan.grid.moved_by(turn.T, np.zeros(3)))
 
     tell("aligning", 0.0)
-    scans = [upright, loaded.toward_lps()]
-    fixed, moving = map(turned, worker.run("correcting the bias field", without_bias_field, scans, settings.threads))
-    tell("aligning", 0.4)
+    fixed, moving = (turned(without_bias_field(scan)) for scan in (upright, loaded.toward_lps()))
     body, labels = turned(body.toward_lps()), labels and turned(labels.toward_lps())
     on = settings.align_on
     rigid = turned(bone.toward_lps()) if bone and on == "bone" else None

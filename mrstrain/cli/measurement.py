@@ -22,10 +22,16 @@ def register(
     registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
 ) -> None:  # fmt: skip
     """Measure displacement and strain between an unloaded image and loaded ones, with a verdict and a report."""
-    carry_out(
-        mrstrain.register.with_options, load0, loads, out=out, subject_files=subject_files, registration=registration,
-        scans=scans, onto=onto, running=running,
-    )  # fmt: skip
+    from dvc.worker import Worker
+
+    pairs = 1 if registration.chain else len(loads) + (scans.repeat is not None)
+    with Worker(running.shares(max(1, pairs))[1]) as worker:
+        # While this process imports all that reads, judges, draws and writes.
+        worker.start("dvc.registration.align", "dvc.registration.gauss_newton.engine")
+        carry_out(
+            mrstrain.register.with_options, load0, loads, out=out, subject_files=subject_files,
+            registration=registration, scans=scans, onto=onto, running=running, worker=worker,
+        )  # fmt: skip
 
 
 @takes_options

@@ -108,8 +108,7 @@ def _registration(record: Record) -> str:
         how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
         f"The loaded image was{before or ', without rigid alignment,'} registered non-rigidly {how}; seed "
-        f"{parameters.get('seed')}. The bias field had been removed from both images (N4, Tustison 2010, as "
-        f"implemented in SimpleITK {versions.get('SimpleITK', '?')}, Lowekamp 2013)."
+        f"{parameters.get('seed')}. The bias field had been removed from both images (N4, Tustison 2010)."
     )
 
 
@@ -124,7 +123,7 @@ def _files(record: Record) -> str:
     code += f" and isal {versions.get('isal', '?')} for compression"
     if "DICOM" in formats:
         code += f", pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} "
-        code += "for pixel data in a JPEG format)"
+        code += "for pixel data in a JPEG format; Lowekamp 2013)"
     return f" {images if formats else 'Maps were written'} by {code}."
 
 

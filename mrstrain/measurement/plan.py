@@ -11,7 +11,7 @@ from dvc import Deformation, Evidence, Image, Measurement, Registration, Setting
 from dvc.errors import MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.error_bars import TwinCheck
-from dvc.measurement.judgement import maps_of, noise_of
+from dvc.measurement.judgement import maps_of
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker
 from mrstrain.measurement.case import Case
@@ -102,5 +102,5 @@ def _twin_check(
 
 def _noisier(found: Registration) -> float:
     """How many times noisier the loaded image is than the unloaded one, for its signal; at least 1."""
-    reference, loaded = noise_of(found)
+    reference, loaded = found.noise
     return 1.0 if loaded is None else max(1.0, reference.snr / loaded.snr)

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,10 +12,9 @@ import numpy as np
 from dvc import Deformation, Engine, Evidence, Image, Settings, read_error_model, read_image, read_landmarks
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
-from dvc.registration.align import without_motion
+from dvc.registration.align import align as align_images, without_motion
 from dvc.registration.engines import DEFAULT
 from dvc.registration.register import refuse_one_image_twice
-from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
@@ -36,7 +36,7 @@ _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plat
 def register(
     load0: Path | str, loads: Sequence[Path | str], *, out: Path | str, subject_files: SubjectFiles,
     registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
-    progress: OnProgress | None = None,
+    progress: OnProgress | None = None, worker: Worker | None = None,
 ) -> Series:  # fmt: skip
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
 
@@ -50,6 +50,8 @@ def register(
         Loaded images. Each gets a folder in ``out`` named after its file.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
+    worker : Worker, optional
+        The process that registers the first load, where it has been started before.
 
     Raises
     ------
@@ -79,9 +81,9 @@ def register(
             "and bone_label (--labels, --bone-label).\n"
             "If the images show no bone, use align image (--align image)."
         )
-    at_once, threads = _shares(running, 1 if registration.chain else len(cases))
-    with Worker(threads) as first:
-        first.start(Plan.__module__)
+    at_once, threads = running.shares(1 if registration.chain else len(cases))
+    with nullcontext(worker) if worker else Worker(threads) as first:
+        first.start(align_images.__module__, type(chosen).__module__)
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
         # Read now: what is wrong with it must not be found after an hour.
@@ -132,11 +134,11 @@ def register_one(
     parameters, and errors, are those of `register`.
     """
     how, missing, threads = registration, series.allow_missing, series.threads or 1
+    chosen = engine_of(how, labelled=True)
     with Worker(threads) as worker:
-        worker.start(Plan.__module__)
+        worker.start(align_images.__module__, type(chosen).__module__)
         subject = read_subject(load0, subject_files, onto, allow_missing=missing)
         loaded = read_image(load, allow_missing=missing)
-        chosen = engine_of(how, labelled=True)
         settings = Settings(chosen, how.align, series.seed, threads)
         model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
         floor = None if series.repeat is None else read_noise_floor(series.repeat / QUALITY)
@@ -174,13 +176,6 @@ def _check_start(scans: Scans, engine: Engine) -> None:
         )
 
 
-def _shares(running: Running, loads: int) -> tuple[int, int]:
-    """Loads at once, and threads of each."""
-    cores = usable_cores()
-    at_once = min(running.workers or cores, cores, loads)
-    return at_once, running.threads or max(1, cores // at_once)
-
-
 class _Run:
     """The loads of one series: registered in worker processes, each written as soon as it is finished."""
 
@@ -209,7 +204,7 @@ class _Run:
             try:
                 done = self.plan.register(name, self.images[name], start, worker, told)
                 if not not_begun:
-                    worker.close()  # its memory is as large as what the maps take now
+                    threading.Thread(target=worker.close).start()  # its memory is as large as what the maps take now
                 if not is_repeat:
                     last.append(done[0].displacement)
                     self._floor_known.wait()

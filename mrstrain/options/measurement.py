@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator
 
+from dvc.threads import usable_cores
 from mrstrain.options.model import Cli, Count, Flag, NotNegative, Options, Positive, Vector
 
 Frame = Literal["LPS", "RAS"]
@@ -134,3 +135,9 @@ class Seeded(Threads):
 
 class Running(Cores, Seeded):
     """Number of threads, loads at the same time, and the seed of random numbers."""
+
+    def shares(self, loads: int) -> tuple[int, int]:
+        """How many of the loads are registered at the same time, and the threads of each."""
+        cores = usable_cores()
+        at_once = min(self.workers or cores, cores, loads)
+        return at_once, self.threads or max(1, cores // at_once)

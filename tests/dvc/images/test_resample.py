@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import SimpleITK as sitk
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from dvc.deformation.protocol import Affine, RigidMotion
-from dvc.images import bias_field
-from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, fill_missing, shows, smoothed
 from dvc.registration.align import _scored
@@ -90,51 +87,6 @@ def test_the_search_scores_an_image_with_itself_as_one():
     assert score == pytest.approx(1.0, abs=0.05)
     assert np.linalg.norm(motion.displacement(np.full((1, 3), 24.0))) < 4.0
     assert isinstance(motion, RigidMotion)
-
-
-@pytest.mark.parametrize("offset", [0.0, 300.0])
-def test_shading_is_removed_whatever_the_images_zero(offset):
-    grid = Grid((40, 40, 40), np.full(3, 2.0), np.zeros(3))
-    X = grid.points() / 80.0
-    body = np.linalg.norm(X - 0.5, axis=-1) < 0.42
-    random = np.random.default_rng(4)
-    tissue = np.where(body, np.where(random.random(grid.shape) < 0.5, 100.0, 60.0), 0.0)
-    field = 1.0 + 0.3 * (X[..., 0] - 0.5) + 0.2 * np.sin(3.0 * X[..., 1])
-    noisy = tissue * field + random.normal(scale=1.0, size=grid.shape)
-    (whole,) = without_bias_field([Image(grid, noisy + offset)])
-    corrected = whole.values - offset
-
-    def unevenness(values: np.ndarray) -> float:
-        bright = body & (tissue == 100.0)
-        return float(values[bright].std() / values[bright].mean())
-
-    assert unevenness(corrected) < 0.5 * unevenness(noisy)
-    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
-    try:
-        for threads in (1, 2, 4):
-            sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(threads)
-            for again in without_bias_field([Image(grid, noisy + offset)] * 2, threads):
-                assert np.array_equal(again.values, whole.values)
-            assert sitk.ProcessObject.GetGlobalDefaultNumberOfThreads() == threads
-    finally:
-        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
-
-
-def test_the_unloaded_image_of_a_series_is_corrected_once(monkeypatch):
-    counted = []
-    correct = bias_field._corrected
-    monkeypatch.setattr(bias_field, "_kept", {})
-    monkeypatch.setattr(bias_field, "_corrected", lambda image: counted.append(image) or correct(image))
-    random = np.random.default_rng(8)
-    grid = Grid((16, 16, 16), np.full(3, 2.0), np.zeros(3))
-    unloaded, *loaded = (Image(grid, 50.0 + random.normal(size=grid.shape)) for _ in range(3))
-    for load in loaded:
-        found = without_bias_field([unloaded, load])
-        np.testing.assert_allclose(found[0].values, correct(unloaded).values, rtol=1e-5)
-    assert len(counted) == 3
-    moved = Image(Grid(grid.shape, np.full(3, 2.5), np.zeros(3)), unloaded.values)
-    assert np.array_equal(without_bias_field([moved, loaded[0]])[0].grid.spacing_mm, moved.grid.spacing_mm)
-    assert len(counted) == 5
 
 
 def test_a_hash_follows_the_voxels_that_a_header_names(tmp_path):

@@ -109,7 +109,7 @@ def test_figures_and_papers_are_those_of_the_records(tmp_path: Path) -> None:
         "Load1 and Load2: The loaded image was aligned with the unloaded one rigidly on the bone",
         "itk-elastix 0.1.2", "mrstrain 9.8.7", "control points every 4.5 mm",
         "1000, 1000, 1000, 500 iterations of 5000",
-        "metric AdvancedNormalizedCorrelation", "seed 5", "SimpleITK 3.4.5", "pytetwild 6.7", "edges of 2.5 mm",
+        "metric AdvancedNormalizedCorrelation", "seed 5", "pytetwild 6.7", "edges of 2.5 mm",
         "trebbi: Set of trebbi (fat: Ogden, mu0 10.54 kPa)", "Load1 140 N normal, 0 N shear", "ansys (csv)",
         "1234 tetrahedra", "from 0.2 to 0.5", "tissue above 0.2, 0.3 and 0.5", "A study of 3 heels.", "no error model",
     ):  # fmt: skip
@@ -117,7 +117,7 @@ def test_figures_and_papers_are_those_of_the_records(tmp_path: Path) -> None:
     for paper in (
         "Klein S, Staring M, Murphy",
         "Shamonin DP",
-        "Lowekamp BC",
+        "Tustison NJ",
         "Hu Y",
         "Trebbi A",
         "Dice LR",
@@ -190,7 +190,7 @@ def test_driven_and_levelled_models_are_not_those_of_other_programs(tmp_path: Pa
 def test_the_correction_of_shading_is_told_where_it_was_done(tmp_path: Path) -> None:
     models = {"ansys": tmp_path / "Load1.csv"}
     text = told({"Load1": measured(tmp_path, "Load1")}, models)
-    assert "removed from both images (N4, Tustison 2010, as" in text
+    assert "removed from both images (N4, Tustison 2010)" in text
     assert text.count("doi:10.1109/TMI.2010.2046908") == 1
     (tmp_path / "given").mkdir()
     assert "Tustison" not in told({"Load1": tmp_path / "given"}, models)
@@ -240,17 +240,14 @@ def with_inputs(folder: Path, *names: str) -> Path:
 @pytest.mark.parametrize("name", ["Load0.nii.gz", "Load0.nii", "a.nrrd", "a.nhdr", "a.mha", "a.mhd", "series"])
 def test_the_libraries_told_are_those_that_read_and_write(tmp_path: Path, name: str) -> None:
     text = told({"Load1": with_inputs(tmp_path, name, name)}, {})
-    (sentence,) = re.findall(r"Images \(.*?in a JPEG format\)\.|Images \(.*?for compression\.", text)
+    (sentence,) = re.findall(r"Images \(.*?in a JPEG format; Lowekamp 2013\)\.|Images \(.*?for compression\.", text)
     suffix = imagefile._known_suffix(name)
     reader = "dvc.io.images.dicom" if suffix is None else imagefile._FORMATS[suffix][1].__module__
     used = libraries_of(reader, set()) | libraries_of("dvc.io.images.write", set())
-    assert set(re.findall(r"[\w-]+(?= \d)", sentence)) == used - {"numpy"}
+    assert set(re.findall(r"[\w-]+(?= \d)", sentence)) - {"Lowekamp"} == used - {"numpy"}
     assert sentence.startswith(f"Images ({imagefile.format_of(name)}) were read, and maps (NIfTI, NRRD) were written")
     for library in used - {"numpy"}:
         assert f"{library} {VERSIONS[library]}" in sentence
-    # N4, for whatever images
-    assert "SimpleITK" in libraries_of("dvc.images.bias_field", set())
-    assert "(N4, Tustison 2010, as implemented in SimpleITK 3.4.5, Lowekamp 2013)" in text
 
 
 def test_every_format_that_was_read_is_told(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from scipy.stats import foldnorm
 
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Image, LabelMap, Mask
-from dvc.images.noise import signal_to_noise
+from dvc.images.noise import noise_of, signal_to_noise
 from dvc.measurement.error_bars import TwinCheck, error_bars
-from dvc.measurement.judgement import noise_of, with_caution
+from dvc.measurement.judgement import with_caution
 from dvc.measurement.page import error_tables
 from dvc.measurement.subject import Subject
 from dvc.registration.elastix.engine import Elastix
@@ -60,8 +60,8 @@ def given(with_labels: bool = True, with_bone: bool = True):
 
 
 def bars_of(found, subject, maps, model, twin=None):
-    snr = min(one.snr for one in noise_of(found) if one is not None)
-    return error_bars(found, subject, maps, snr, model, twin)
+    found.noise = noise_of(found.reference, found.loaded, found.tissue)
+    return error_bars(found, subject, maps, model, twin)
 
 
 def test_every_bone_is_left_out_whatever_its_name() -> None:
@@ -133,15 +133,15 @@ def test_the_noisier_image_counts() -> None:
 def test_tissue_outside_the_mask_is_no_air() -> None:
     """With it for air, noise would be a third larger; where no threshold finds the body, noise is not known."""
     found, _, _ = given()
-    whole = noise_of(found)
-    part = found.tissue.inside.copy()
-    part[12:] = False
-    found.tissue = Mask(GRID, part)
-    assert noise_of(found)[0].in_air == pytest.approx(20.0, rel=0.1)
-    assert noise_of(found)[0].snr == pytest.approx(whole[0].snr, rel=0.05)
-    assert signal_to_noise(found.reference, found.tissue) < 0.8 * whole[0].snr
-    found.reference = Image(GRID, np.full(GRID.shape, 500.0))
-    assert noise_of(found)[0].in_air is None
+    image, inside = found.reference, found.tissue.inside.copy()
+    whole, _ = noise_of(image, image, found.tissue)
+    inside[12:] = False
+    of_part = Mask(GRID, inside)
+    seen, _ = noise_of(image, image, of_part)
+    assert seen.in_air == pytest.approx(20.0, rel=0.1)
+    assert seen.snr == pytest.approx(whole.snr, rel=0.05)
+    assert signal_to_noise(image, of_part) < 0.8 * whole.snr
+    assert noise_of(Image(GRID, np.full(GRID.shape, 500.0)), image, of_part)[0].in_air is None
 
 
 def test_several_stages_have_no_known_error() -> None:

@@ -13,6 +13,7 @@ import pytest
 from dvc.deformation.bspline import BSpline
 from dvc.errors import InputError, OutputError, RegistrationError
 from dvc.images.image import Image, Mask
+from dvc.images.noise import noise_of
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels, write_mask
 from dvc.io.transforms.elastix_text import parse_parameters
@@ -74,8 +75,9 @@ class Spy:
         if name == "Turned":
             raise RegistrationError("turned")
         found = self.found[name] = replace(self.spline)
+        noise = noise_of(reference, loaded, tissue)[0]
         alignment = Alignment(np.nan, "bone", 0.5, 0.9, 0.01, np.zeros(3))  # type: ignore[arg-type]
-        return Registration(reference, loaded, tissue, bone, alignment, found, settings, 1.0)
+        return Registration(reference, loaded, tissue, bone, alignment, found, settings, 1.0, (noise, noise))
 
 
 @pytest.fixture

@@ -72,16 +72,6 @@ def block(at: np.ndarray) -> Image:
     return Image(GRID, (np.where(inside, 100.0, 10.0) + noise).astype(np.float32))
 
 
-@pytest.fixture(autouse=True)
-def without_bias_field(monkeypatch):
-    """N4 would take most of the time, and there is none in these images."""
-    monkeypatch.setattr("dvc.registration.register.without_bias_field", unchanged)
-
-
-def unchanged(images: list[Image], threads: int) -> list[Image]:
-    return images
-
-
 BODY = Mask(GRID, block(np.zeros(3, dtype=int)).values > 50.0)
 LOADED = np.rint(SHIFT / 1.5).astype(int)
 

@@ -21,6 +21,7 @@ import pytest
 
 from dvc import Alignment, BSpline, Image, Registration, RigidMotion
 from dvc.errors import InputError, MrstrainError, OutputError
+from dvc.images.noise import Noise
 from dvc.registration.elastix.presets import load_preset
 from dvc.registration.gauss_newton.fit import control_grid, spline_through
 from dvc.worker import Worker
@@ -115,7 +116,9 @@ def test_a_perfect_registration_has_no_error_and_resolves_the_wave(monkeypatch: 
         control = control_grid(reference.grid, np.full(3, 3.0))
         spline = BSpline(control, spline_through(wave, control))
         still = Alignment(RigidMotion.identity(), "none", 0.0, 1.0, 0.0, np.zeros(3))
-        return Registration(reference, loaded, given["tissue"], None, still, spline, given["settings"], 1.0)
+        return Registration(
+            reference, loaded, given["tissue"], None, still, spline, given["settings"], 1.0, (Noise(None, 25.0),) * 2
+        )
 
     monkeypatch.setattr("phantoms.accuracy_run.register", perfect)
     run = measure_run(case, SimpleNamespace(threads=1), nullcontext(), lambda _: None)  # type: ignore[arg-type]
