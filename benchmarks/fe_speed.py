@@ -1,9 +1,11 @@
-"""Time and memory of one lift of the sole, beside CalculiX, on the same mesh, laws and supports, one thread each.
+"""Time and memory of one lift of the sole, beside CalculiX and FEBio, one thread each.
 
     .venv/bin/python -m benchmarks.fe_speed heel.vtu --out benchmarks/results/fe_speed.json
 
-Bone is fixed, and the skin nearest to the plate is lifted by 1.5 mm, in one step. Programs run one after
-the other, each in a process of its own; what is compiled is compiled beforehand. Needs `ccx` (Debian: calculix-ccx).
+All have the same mesh, laws and supports: bone is fixed, and the skin nearest to the plate is lifted by 1.5 mm, in one
+step. Programs run one after the other, each in a process of its own; what is compiled is compiled beforehand. Uses
+`ccx` (Debian: calculix-ccx) and `febio4` where they are installed; FEBio 4 can be built from its source with MKL
+(-DUSE_MKL=ON, and `#include <cstring>` in FECore/FSPath.cpp).
 """
 
 from __future__ import annotations
@@ -11,7 +13,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -23,10 +27,20 @@ import numpy as np
 
 from dvc import TetMesh
 from dvc.arrays import IntArray
-from fe import LoadState, LoadStep, PlateState, Tolerance, material_set, read_tet_mesh, write_calculix
+from fe import (
+    LoadState,
+    LoadStep,
+    PlateState,
+    Tolerance,
+    material_set,
+    read_tet_mesh,
+    write_calculix,
+    write_febio,
+)
 from fe.assembly import Assembler
 from fe.elements import Model, edges_of, element
 from fe.linear import Solver
+from fe.materials import Materials
 from fe.newton import Imposed, equilibrium
 from mrstrain.records.provenance import versions
 
@@ -75,8 +89,8 @@ def ours(place: Path, name: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def calculix(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
-    """CalculiX on our deck."""
+def problem(place: Path) -> tuple[TetMesh, Materials, LoadState]:
+    """Mesh, laws and the lift as a state that decks can be written of."""
     mesh = read_tet_mesh(place)
     laws, _ = material_set("trebbi").for_regions(mesh.regions)
     nodes, _ = lifted(mesh)
@@ -85,6 +99,43 @@ def calculix(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
     cells = len(mesh.cells)
     still = PlateState(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
     state = LoadState(LoadStep("lift", 1.0), 1.0, u, np.zeros(cells), np.zeros((cells, 3, 3)), nodes, (still,), 0, 0.0)
+    return mesh, laws, state
+
+
+def febio(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
+    """FEBio on our deck, in one step."""
+    mesh, laws, state = problem(place)
+    forces = '<logfile><node_data data="Rx;Ry;Rz" node_set="plate" file="force.txt" /></logfile>'
+    with tempfile.TemporaryDirectory() as folder:
+        deck = Path(folder) / "lift.feb"
+        write_febio(deck, mesh, laws, state, quadratic=quadratic)
+        told = deck.read_text()
+        for usual, here in (
+            ("<time_steps>20<", "<time_steps>1<"), ("<step_size>0.05<", "<step_size>1<"),
+            ("<dtmax>0.1<", "<dtmax>1<"), ("<opt_iter>12<", "<opt_iter>20<"), ("</plotfile>", f"</plotfile>{forces}"),
+        ):  # fmt: skip
+            assert usual in told
+            told = told.replace(usual, here)
+        deck.write_text(told)
+        one_thread = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+        began = time.perf_counter()
+        try:
+            done = subprocess.run(
+                ["febio4", "-i", "lift.feb"], cwd=folder, capture_output=True, text=True, timeout=limit_s,
+                env=one_thread, check=True,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return {"seconds": None, "given_up_after_s": limit_s}
+        seconds = time.perf_counter() - began
+        last = (Path(folder) / "force.txt").read_text().split("*Step")[-1].splitlines()
+    force = sum(float(line.split()[3]) for line in last if line[:1].isdigit())
+    iterations = re.findall(r"Total number of equilibrium iterations[ .]*: (\d+)", done.stdout)
+    return {"seconds": seconds, "force_n": abs(force), "iterations": int(iterations[-1])}
+
+
+def calculix(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
+    """CalculiX on our deck."""
+    mesh, laws, state = problem(place)
     with tempfile.TemporaryDirectory() as folder:
         deck = Path(folder) / "lift.inp"
         write_calculix(deck, mesh, laws, state, quadratic=quadratic)
@@ -109,15 +160,17 @@ def main() -> None:
     parser.add_argument("mesh", type=Path)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--limit", type=float, default=1200.0, help="seconds for one run of CalculiX")
+    parser.add_argument("--limit", type=float, default=1200.0, help="seconds for one run of another program")
     parser.add_argument("--one", help="run one program here and print its figures")
     given = parser.parse_args()
     if given.one:
         if given.one.startswith("P"):
             ours(given.mesh, given.one)  # compiles
             found = ours(given.mesh, given.one)
-        else:
+        elif given.one.startswith("C3D"):
             found = calculix(given.mesh, given.one == "C3D10", given.limit)
+        else:
+            found = febio(given.mesh, given.one == "tet10", given.limit)
         who = resource.RUSAGE_SELF if given.one.startswith("P") else resource.RUSAGE_CHILDREN
         print(json.dumps(found | {"peak_gib": resource.getrusage(who).ru_maxrss / 2**20}))
         return
@@ -127,8 +180,11 @@ def main() -> None:
         "versions": versions(), "cells": len(mesh.cells), "nodes": len(mesh.points_mm), "lifted": len(nodes),
         "runs": [],
     }  # fmt: skip
+    febio_too, calculix_too = shutil.which("febio4") is not None, shutil.which("ccx") is not None
+    linear = ["P1", *["tet4"] * febio_too, *["C3D4"] * calculix_too]
+    quadratic = [*["tet10"] * febio_too, *["C3D10"] * calculix_too]
     for number in range(given.rounds):
-        for name in ("P1", "C3D4", "C3D10") if number == 0 else ("P1", "C3D4"):
+        for name in [*linear, *quadratic] if number == 0 else linear:
             argv = [sys.executable, "-m", "benchmarks.fe_speed", str(given.mesh), "--one", name]
             said = subprocess.run([*argv, "--limit", str(given.limit)], capture_output=True, text=True, check=True)
             results["runs"].append({"program": name} | json.loads(said.stdout.splitlines()[-1]))

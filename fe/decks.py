@@ -7,6 +7,7 @@ FEBio 4 the other.
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -134,8 +135,8 @@ def write_febio(
 ) -> None:  # fmt: skip
     """Write an FEBio 4 deck (.feb) of a state, mm, N and MPa, LPS; parameters as `write_calculix`.
 
-    The volumetric energy is FEBio's pressure model "Abaqus", K / 2 (J - 1)^2, the same as in `fe.materials`. The file
-    follows the description of the format and the names in FEBio's source code; it has not been tested with FEBio.
+    The volumetric energy is FEBio's pressure model "Abaqus", K / 2 (J - 1)^2, the same as in `fe.materials`. Elements
+    are numbered region by region, in the order of ``materials``.
 
     Raises
     ------
@@ -152,17 +153,18 @@ def write_febio(
     for number, (region, law) in enumerate(materials.items(), start=1):
         kind, numbers = _febio_law(region, law)
         material = _child(listed, "material", id=str(number), name=_short("M", region, materials), type=kind)
-        for name, size in (*numbers.items(), ("k", law.bulk_modulus_mpa)):
-            _child(material, name, f"{size:.12g}")
+        for name, value in (*numbers.items(), ("k", f"{law.bulk_modulus_mpa:.12g}")):
+            _child(material, name, value)
         _child(material, "pressure_model", "Abaqus")
     whole = _child(root, "Mesh")
     nodes = _child(whole, "Nodes", name="all")
     for number, place in enumerate(space.nodes_mm.tolist(), start=1):
         _child(nodes, "node", ",".join(f"{v:.12g}" for v in place), id=str(number))
+    elements_so_far = count(1)  # FEBio's reader refuses a number that is not above all before it
     for region in materials:
         elements = _child(whole, "Elements", type="tet10" if quadratic else "tet4", name=_short("E", region, materials))
         for cell in mesh.regions[region]:
-            _child(elements, "elem", ",".join(str(n + 1) for n in space.cells[cell]), id=str(cell + 1))
+            _child(elements, "elem", ",".join(str(n + 1) for n in space.cells[cell]), id=str(next(elements_so_far)))
     for name, members in (("bone", held), ("plate", on_plate)):
         _child(whole, "NodeSet", ",".join(str(n + 1) for n in members), name=name)
     domains = _child(root, "MeshDomains")
@@ -192,14 +194,20 @@ def _child(parent: ElementTree.Element, tag: str, text: str | None = None, /, **
     return made
 
 
-def _febio_law(region: str, law: Material) -> tuple[str, dict[str, float]]:
+def _febio_law(region: str, law: Material) -> tuple[str, dict[str, str]]:
+    """The name of a material in FEBio, and its parameters.
+
+    Yeoh's law is written as an energy, which FEBio differentiates. FEBio 4.11 has a material "Yeoh", too, but its
+    stress lacks the factor i of dW/dI1 = sum i c_i (I1 - 3)^(i - 1): the stress of another law than its energy's.
+    """
     c10, c20, c30 = law.vector[:3].tolist()
     pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
     numbers = {f"c{n}": 2.0 * mu for n, (mu, _) in enumerate(pairs, start=1)}  # c = 2 mu0, see Ogden.from_febio
+    numbers |= {f"m{n}": alpha for n, (_, alpha) in enumerate(pairs, start=1)}
     forms = {
-        NeoHooke: ("Mooney-Rivlin", {"c1": c10, "c2": 0.0}),
-        Yeoh: ("Yeoh", {"c1": c10, "c2": c20, "c3": c30}),
-        Ogden: ("Ogden", numbers | {f"m{n}": alpha for n, (_, alpha) in enumerate(pairs, start=1)}),
+        NeoHooke: ("Mooney-Rivlin", {"c1": f"{c10:.12g}", "c2": "0"}),
+        Yeoh: ("uncoupled hyperelastic", {"W": f"{c10:.12g}*(I1-3){c20:+.12g}*(I1-3)^2{c30:+.12g}*(I1-3)^3"}),
+        Ogden: ("Ogden", {name: f"{number:.12g}" for name, number in numbers.items()}),
     }
     if type(law) not in forms:
         raise InputError(f"{region}: FEBio decks do not support the model '{law.law}'. Choose another material set.")
