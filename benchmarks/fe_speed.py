@@ -2,9 +2,9 @@
 
     .venv/bin/python -m benchmarks.fe_speed heel.vtu --out benchmarks/results/fe_speed.json
 
-All have the same mesh, laws and supports: bone is fixed, and the skin nearest to the plate is lifted by 1.5 mm, in one
-step. Programs run one after the other, each in a process of its own; what is compiled is compiled beforehand. Uses
-`ccx` (Debian: calculix-ccx) and `febio4` where they are installed; FEBio 4 can be built from its source with MKL
+All have the same mesh, laws and supports: bone is fixed, and the skin nearest to the plate is lifted by 1.5 mm.
+Programs run one after the other, each in a process of its own; what is compiled is compiled beforehand. Uses `ccx`
+(Debian: calculix-ccx) and `febio4` where they are installed; FEBio 4 can be built from its source with MKL
 (-DUSE_MKL=ON, and `#include <cstring>` in FECore/FSPath.cpp).
 """
 
@@ -103,7 +103,7 @@ def problem(place: Path) -> tuple[TetMesh, Materials, LoadState]:
 
 
 def febio(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
-    """FEBio on our deck, in one step."""
+    """FEBio on our deck in four steps, which it solves in half the time of one (or of full Newton in either)."""
     mesh, laws, state = problem(place)
     forces = '<logfile><node_data data="Rx;Ry;Rz" node_set="plate" file="force.txt" /></logfile>'
     with tempfile.TemporaryDirectory() as folder:
@@ -111,8 +111,9 @@ def febio(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
         write_febio(deck, mesh, laws, state, quadratic=quadratic)
         told = deck.read_text()
         for usual, here in (
-            ("<time_steps>20<", "<time_steps>1<"), ("<step_size>0.05<", "<step_size>1<"),
-            ("<dtmax>0.1<", "<dtmax>1<"), ("<opt_iter>12<", "<opt_iter>20<"), ("</plotfile>", f"</plotfile>{forces}"),
+            ("<time_steps>20<", "<time_steps>4<"), ("<step_size>0.05<", "<step_size>0.25<"),
+            ("<dtmax>0.1<", "<dtmax>0.25<"), ("<opt_iter>12<", "<opt_iter>20<"),
+            ("</plotfile>", f"</plotfile>{forces}"),
         ):  # fmt: skip
             assert usual in told
             told = told.replace(usual, here)
