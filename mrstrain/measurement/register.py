@@ -68,16 +68,13 @@ def register(
         if subject_files.labels is not None:
             raise InputError(
                 "The images are aligned on a rigid bone, and none is given.\n"
-                f"Name the label of the bone in {subject_files.labels.name}, or pass a mask of it: bone_label or bone "
-                "(--bone-label, --bone).\n"
-                "If the images show no bone, use align image (--align image)."
+                f"Name the label of the bone in {subject_files.labels.name}, bone_label (--bone-label), or give its "
+                "mask, bone (--bone). If the images show no bone, use align image (--align image)."
             )
         raise InputError(
-            "The images are aligned on a rigid bone, and none is given.\n"
-            f"In ITK-SNAP or 3D Slicer, segment the bone of the body part (in a heel, the calcaneus) on {load0.name}, "
-            "save it as NIfTI, and pass it as bone (--bone); or pass a label map and the name of its bone, as labels "
-            "and bone_label (--labels, --bone-label).\n"
-            "If the images show no bone, use align image (--align image)."
+            f"The images are aligned on a rigid bone, and none is given. Segment it on {load0.name} (in a heel, the "
+            "calcaneus) in ITK-SNAP or 3D Slicer, and pass the NIfTI file as bone (--bone), or a label map with it "
+            "(--labels, --bone-label). If there is no bone, use align image (--align image)."
         )
     at_once, threads = _shares(running, 1 if registration.chain else len(cases))
     with Worker(threads) as first:
