@@ -12,6 +12,7 @@ from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
+from dvc.measurement.subject import is_bones_name
 from dvc.report.page import Section
 from dvc.threads import usable_cores
 from dvc.worker import side_by_side
@@ -85,7 +86,8 @@ def compare(
     target, tell, measurements = Path(out), progress or (lambda *_: None), result_folders(Path(dvc), loads)
     labelling, labels_given = fill_labels(labelling, measurements), labelling
     assert labelling.labels is not None
-    tissues, bones = read_labels(labelling.labels, labelling.names), labelling.bones or (BONE,)
+    tissues = read_labels(labelling.labels, labelling.names)
+    bones = labelling.bones or _usual_bones(tissues)
     thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
     criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     usual, of_load = fill_directions(directions, measurements)
@@ -131,6 +133,13 @@ def compare(
         parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
     share(1.0)
     return Compared(target, result, *parts, taken)
+
+
+def _usual_bones(labels: LabelMap) -> tuple[str, ...]:
+    """The bone of a label map where none is named: "bone", or none where the name of every label is of soft tissue."""
+    names = labels.names.values()
+    unclear = BONE in names or any(is_bones_name(name) or name.startswith("label-") for name in names)
+    return (BONE,) if unclear else ()
 
 
 def _at_once(loads: int) -> int:
