@@ -25,7 +25,7 @@ from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
 
 _BYTES_OF_A_LOAD = 1 << 30  # approximate memory of the process that compares one load
@@ -75,7 +75,7 @@ def compare(
     labelling, reading, directions, comparison
         Their fields are given as keywords, such as ``strains=...``.
     progress : callable, optional
-        ``progress(case, stage, fraction)``.
+        ``progress(case, stage, fraction)``; the case "note" first tells what was taken from the record.
 
     Raises
     ------
@@ -86,13 +86,15 @@ def compare(
     target, tell, measurements = Path(out), progress or (lambda *_: None), result_folders(Path(dvc), loads)
     labelling, labels_given = fill_labels(labelling, measurements), labelling
     assert labelling.labels is not None
+    usual, of_load = fill_directions(directions, measurements)
+    more = [f"(and the plate's directions of {', '.join(of_load)})"] if of_load else []
+    taken = taken_from_record(Path(dvc), (labels_given, labelling), (directions, usual), more=more)
+    for line in taken:  # now, so that a wrong file is noticed before an hour is spent on it
+        tell(NOTE, line, 0.0)
     tissues = read_labels(labelling.labels, labelling.names)
     bones = labelling.bones or _usual_bones(tissues)
     thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
     criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
-    usual, of_load = fill_directions(directions, measurements)
-    more = [f"(and the plate's directions of {', '.join(of_load)})"] if of_load else []
-    taken = taken_from_record(Path(dvc), (labels_given, labelling), (directions, usual), more=more)
     pairs = {load: (of.plate_normal, of.shear_direction) for load, of in of_load.items()} | dict(towards or {})
     axes, own = _axes(usual.plate_normal, usual.shear_direction), {load: _axes(*of) for load, of in pairs.items()}
     files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], reading, to_image)

@@ -20,7 +20,7 @@ from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.measured_with import MeasuredWith
 from mrstrain.records.outcome import Outcome
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
@@ -67,6 +67,8 @@ def level(
         raise InputError(f"{place} is not a folder with the results of a model (one file for each load).")
     if holds_results(load0):
         load0, subject_files, engine, taken = _from_record(load0, subject_files, engine)
+    for line in taken:  # now, so that a wrong file is noticed before an hour is spent on it
+        (progress or (lambda *_: None))(NOTE, line, 0.0)
     # Incompressibility is always enforced: the displacement extrapolated outside the model's mesh is not isochoric.
     volume = volume_kept(engine)
     how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)

@@ -302,7 +302,8 @@ def test_what_was_measured_with_is_not_asked_for_again(study: Path) -> None:
     argv = ["compare", load, study / "half" / "Load1.vtu", "--out", study / "one"]
     ran = CliRunner().invoke(app, [str(a) for a in argv])
     assert ran.exit_code == 0, ran.output
-    (taken,) = [line for line in ran.output.splitlines() if line.startswith(f"From the record of {load}: ")]
+    (taken,) = [line for line in ran.stdout.splitlines() if line.startswith(f"From the record of {load}: ")]
+    assert ran.stderr.splitlines()[0] == taken  # at the start, and again with the results
     assert f"--labels {files['labels']} --names {files['names']} --bone bone " in taken
     assert taken.endswith(" --plate-normal 1 0 0 --shear-direction 0 1 0")
     told = json.loads((study / "one" / "comparison.json").read_text())
