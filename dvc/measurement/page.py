@@ -24,6 +24,8 @@ STRAIN = "Maximum shear strain"
 """Title of the picture of the strain."""
 SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
 """Upper ends of the colours for maximum shear strain and its standard deviation."""
+FIXED_WEIGHTS = "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
+"""In place of the table of weights, for a repeat scan."""
 _TWIN = (
     "The unloaded image was warped by the measured displacement, fresh noise was added, and the pair was registered "
     "like the real one. Its true strain is the measured strain above, so the table shows the error that the noise and "
