@@ -93,6 +93,11 @@ def compare(
         tell(NOTE, line, 0.0)
     tissues = read_labels(labelling.labels, labelling.names)
     bones = labelling.bones or _usual_bones(tissues)
+    if not bones:
+        names = ", ".join(tissues.names.values())
+        tell(
+            NOTE, f"No label is called bone: {names} are compared as soft tissue. Name a bone among them (--bone).", 0.0
+        )
     thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
     criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     pairs = {load: (of.plate_normal, of.shear_direction) for load, of in of_load.items()} | dict(towards or {})

@@ -99,7 +99,7 @@ def level(
         else:
             _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
-        raise RegistrationError(" ".join(failures))
+        raise RegistrationError("\n".join(failures))
     told = f"Levelled model, for compare: {target / name}"
     return Outcome(target / name, (*taken, *notes, *smoothed, *failures, told))
 

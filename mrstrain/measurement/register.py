@@ -26,6 +26,7 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.options.model import Flag
 from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
+from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
@@ -226,8 +227,8 @@ class _Run:
     def finished(self) -> tuple[Case, ...]:
         """The loads that were registered, in the order given; RegistrationError where none was."""
         if not self.cases:
-            reasons = " ".join(f"{name}: {reason}" for name, reason in self.failures.items())
-            raise RegistrationError(f"No load could be registered. {reasons}")
+            reasons = [f"{name}: {reason}" for name, reason in self.failures.items()]
+            raise RegistrationError(with_reasons("No load could be registered.", reasons))
         return tuple(self.cases[name] for name in self.images if name in self.cases)
 
     def _told(self, case: str, stage: str, fraction: float) -> None:

@@ -345,8 +345,12 @@ def test_tissue_without_bone_is_compared_and_its_report_leaves_out_what_needs_bo
     soft = LabelMap(tissues.grid, np.where(tissues.labels == 3, 0, tissues.labels), {1: "fat", 2: "skin"})
     write_labels(study / "tissues.nii.gz", soft)
     (study / "tissues.csv").write_text("label,name\n1,fat\n2,skin\n")
-    done = compare(study / "measured", [study / "half", study / "right"], **given(study))
+    told = list[tuple[str, str, float]]()
+    models = [study / "half", study / "right"]
+    done = compare(study / "measured", models, **given(study), progress=lambda *one: told.append(one))
     assert [a.model for a in done.comparison.ranking.areas] == ["right", "half"]
+    assert told[0][0] == "note"
+    assert "No label is called bone: fat, skin are compared as soft tissue." in told[0][1]
     (said,) = [note for note in done.comparison.notes if "no bone" in note]
     assert "all of its labels (fat, skin) are compared as soft tissue" in said
     # the error is known by distance to bone; without one it would be taken for that of tissue far away
