@@ -122,8 +122,8 @@ def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int)
     """The unloaded image warped by each result, with fresh noise; and notes on results that were smoothed for it."""
     if subject.bone is None:
         raise InputError(
-            "A forward-model comparison needs the bone, in which the displacement is zero: give its mask (bone), or a "
-            "label map and the name of its label (labels, bone_label)."
+            "A forward-model comparison needs the bone, in which the displacement is zero. Give its mask as bone "
+            "(--bone), or a label map and the name of its label as labels and bone_label (--labels, --bone-label)."
         )
     images, notes = {}, []
     body = subject.tissue or tissue_mask(subject.reference)

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 import dvc
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.io import result_folder as files
+from dvc.measurement.page import key_figures
 from dvc.registration.register import Settings
 from dvc.report.page import Picture
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
@@ -185,9 +186,20 @@ def test_a_repeat_scan_has_what_applies_to_it_alone(tiny_pair, measured, worker)
         note == "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
     )
     assert "error bars" not in str(repeat).lower()
+    assert [("A repeat scan without load" in str(one)) for one in (loaded, repeat)] == [True, False]
     assert repeat.sigma is None
     assert repeat.error_bars.as_dict() == {"known": False, "reason": "A repeat scan has none: its strain is the error."}
     assert any("Noise floor" in str(row[0]) for row in sections[1].tables[0].rows)
+
+
+def test_images_that_were_aligned_as_a_whole_have_no_figures_of_a_bone(stretched):
+    moved = {"rotation_deg": 1.0, "bone_shift_lps_mm": [1.0, 0.0, 0.0], "similarity_before": 0.5, "similarity": 0.9}
+    moved |= {"repeatability_rms_mm": 0.1, "control_spacing_mm": [4.0, 4.0, 4.0], "engine": "gauss-newton"}
+    rows = {on: str(key_figures(stretched.quality, moved | {"on": on}).rows) for on in ("bone", "image")}
+    assert "Rotation of the bone" in rows["bone"]
+    assert "Rotation of the body" in rows["image"]
+    assert "bone" not in rows["image"]
+    assert stretched.drawings()["strain"].caption.endswith("Slices through the middle of the tissue.")
 
 
 def test_a_notebook_shows_the_verdict_a_picture_and_a_table_all_escaped(stretched):
