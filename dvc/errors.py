@@ -1,6 +1,7 @@
 """The errors of mrstrain: one root, and each also a ValueError or a RuntimeError.
 
-A message says what was wrong, which rule it broke, which value was found, and what to do next.
+A message says what was wrong, which rule it broke, which value was found, and what to do next, in at most three lines
+of 100 characters (`tests/test_messages.py`); full detail goes to the log.
 """
 
 

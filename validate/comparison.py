@@ -253,7 +253,8 @@ def compare(
     cases : sequence of LoadCase
         Each with at least one model (`LoadCase.of`).
     labels, bones : LabelMap, sequence of str
-        Tissues of the unloaded image, and which of them are bone.
+        Tissues of the unloaded image, and which of them are bone. Without bone (an empty sequence) nothing is given by
+        distance to bone, and no uncertainty.
     mesh : TetMesh, optional
         Mesh on which fields are compared; by default the mesh of the first model of each load.
     criteria : Criteria, optional
@@ -343,6 +344,10 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
         ]
     if unknown := ", ".join(one.load for one in loads if one.case.error is None):
         what = "the measurement has no error model, so its uncertainty is unknown"
+        if not loads[0].bones:
+            what = "the error of the measurement is known by distance to bone only, so its uncertainty is unknown"
+            soft = ", ".join(loads[0].labels.names.values())
+            notes.append(f"The label map has no bone; all of its labels ({soft}) are compared as soft tissue.")
         notes.append(f"{unknown}: {what} and no difference is significant.")
     return notes
 

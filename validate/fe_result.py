@@ -113,7 +113,9 @@ def read_result(
     rigid = _rigid(np.eye(4) if to_image is None else to_image)
     moved = np.asarray(carry @ np.nan_to_num(u)) @ rigid.matrix.T
     largest = float(np.linalg.norm(moved, axis=1).max())
-    if not 0.0 < largest < _MOST_MM:
+    if largest == 0.0:
+        raise InputError(f"{place}: the displacement is 0 everywhere, as in the unloaded state. Export the loaded one.")
+    if not largest < _MOST_MM:
         raise InputError(
             f"{place}: the largest displacement is {largest:.3g} mm, which is implausible for tissue under a plate. "
             "Check the unit, and that the last load step was exported."
@@ -167,6 +169,11 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
             )
         raise InputError(f"{has} Name the array {_NAMES[1]!r}; its unit must be that of the coordinates.")
     values = source.at_nodes[name]
+    if place.suffix.lower() == ".xplt" and not values.any():
+        raise InputError(
+            f"{place}: the displacement in its last state is 0 everywhere, as at time 0: FEBio wrote no loaded state. "
+            "See FEBio's log, and set <plot_level>PLOT_MAJOR_ITRS</plot_level> in its <Control>."
+        )
     if values.shape != source.points_mm.shape:
         raise InputError(f"{place}: the array '{name}' has shape {values.shape}; three components per node are needed.")
     return values

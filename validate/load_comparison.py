@@ -200,6 +200,8 @@ def compare_load(
     models = {result.name: result.deformation for result in results}
     fields = map_fields(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)
     truths: list[FloatArray] = []
+    if not bones:
+        case = replace(case, error=None)  # it is known by distance to bone
     known = {} if case.error is None else _bands(fields, case, case.error, by, truths)
     normal = -case.axes[:, 0]
     return LoadComparison(

@@ -49,7 +49,7 @@ class MappedFields:
     points_mm, volumes_ml, tissue : (n, 3), (n,), (n,) str
         Centroids, volumes and tissues of the cells.
     to_bone_mm : (n,)
-        Distance to the surface of bone.
+        Distance to the surface of bone; NaN without bone.
     """
 
     mesh: TetMesh
@@ -137,7 +137,7 @@ def map_fields(
     labels : LabelMap
         Of the unloaded image.
     bones : sequence of str
-        Labels of bone; cells with their centroid in bone are not compared.
+        Labels of bone; cells with their centroid in bone are not compared. Empty where no label is bone.
 
     Raises
     ------
@@ -150,7 +150,9 @@ def map_fields(
     mesh, tissue = mesh if soft.all() else _part(mesh, np.flatnonzero(soft)), tissue[soft]
     points = mesh.centroids_mm
     bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
-    distance, _ = cKDTree(labels.grid.points(bone)).query(points)
+    distance = np.full(len(points), np.nan)
+    if bone.any():
+        distance, _ = cKDTree(labels.grid.points(bone)).query(points)
     distance = np.maximum(distance - 0.5 * labels.grid.spacing_mm.min(), 0.0)  # to the surface, not to voxel centres
     by_model, volumes = {name: _sampled(model, points) for name, model in models.items()}, mesh.volumes_mm3 / 1000.0
     fields = MappedFields(mesh, points, volumes, tissue, distance, _sampled(measured, points), by_model)

@@ -71,9 +71,9 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
         there = labels.grid.points(labelled)
         own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
-            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: {own}; labelled soft "
-            f"tissue: {of_tissue} (LPS mm). The model may be rotated, mirrored or shifted, or the label map may be of "
-            "another subject. Check unit and frame, or give the rigid map to the frame of the image (to_image)."
+            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: {own}; tissue: "
+            f"{of_tissue} (LPS mm). Check that both are of one subject, and the model's unit and frame; or give the "
+            "rigid map to the image (to_image)."
         )
     return overlap
 

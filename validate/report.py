@@ -61,15 +61,15 @@ Drawn = tuple[dict[str, Drawing], Viewer, Strip]
 def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Drawn:
     """Draw a load; ``models`` are those of all loads, ``image`` is the anatomy in all viewers."""
     measured, results = one.case.read()
-    fields, axes, bone = one.fields, one.case.axes, one.bones[0]
+    fields, axes = one.fields, one.case.axes
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
     tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
-    point = lowest_bone_point(one.labels, bone, axes)
+    middle = fields.mesh.bounds_mm.mean(axis=0)
+    lowest = lowest_bone_point(one.labels, one.bones[0], axes) if one.bones else middle
+    point, through = lowest, f"The slice goes through {_place(one)}."
     across = (fields.mesh.points_mm - point) @ axes[:, 2]
-    through = f"The slice goes through the lowest point of {bone}."
     if not across.min() < 0.0 < across.max():
-        point = fields.mesh.bounds_mm.mean(axis=0)
-        through = f"The slice goes through the middle of the mesh, since the lowest point of {bone} is outside of it."
+        point, through = middle, f"The slice goes through the middle of the mesh, since {_place(one)} is outside of it."
     slices = one, measured, displacements, point
     agreement = figures.agreement_bins(fields)
     drawings = {
@@ -84,8 +84,12 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
         bins = figures.difference_bins(fields, quantity)
         data = figures.columns_of(bins, f"mean_{name}", f"difference_{name}")
         drawings[stem] = Drawing.of(title, figures.differences, bins, one, quantity, data=data)
-    lowest = lowest_bone_point(one.labels, bone, axes)
     return drawings, _viewer(one, measured, results, image), Strip.of(one, measured, results, lowest)
+
+
+def _place(one: LoadComparison) -> str:
+    """Where slices go through, in words."""
+    return f"the lowest point of {one.bones[0]}" if one.bones else "the middle of the mesh"
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
@@ -156,7 +160,7 @@ def drawings_of_all(
     highest = max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
     informative = ranking.areas and ALL_LOADS not in ranking.uninformative
     best = "the best match over all loads" if informative else "a model"
-    note = f"Lower row: {model}, {best}. {strips[0].title}, through the lowest point of the bone."
+    note = f"Lower row: {model}, {best}. {strips[0].title}, through {strips[0].place}."
     slices, of_all = (strips, model, highest), [curve for curve in curves if curve.tissue == ALL]
     return {
         "slices_by_load": Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note),
@@ -283,10 +287,14 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
     return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
 
 
-def _agreement(one: LoadComparison) -> tuple[Table, Table]:
-    """Agreement cell by cell: by tissue, and by distance to bone."""
+def _agreement(one: LoadComparison) -> tuple[Table, ...]:
+    """Agreement cell by cell: by tissue, and, where there is bone, by distance to bone."""
     names, tissues = {"max_shear": "shear", "u_mm": "u, mm"}, (ALL, *one.fields.tissues)
     rows: list[tuple[Cell, ...]] = [(a.model, names[a.quantity], a.part, *_rounded(a, 6)) for a in one.agreements]
+    by_distance = Table(
+        "Agreement by distance to bone", ("model", "quantity", "where", *_AGREED),
+        tuple(row for row in rows if row[2] not in tissues), "In all soft tissue, as above.",
+    )  # fmt: skip
     return (
         Table(
             "Agreement cell by cell",
@@ -297,11 +305,8 @@ def _agreement(one: LoadComparison) -> tuple[Table, Table]:
             "three components, RMSE is that of the difference vector, and the other values are of the magnitude. All "
             "values are as measured and have no intervals; there is no error model of displacement.",
         ),
-        Table(
-            "Agreement by distance to bone", ("model", "quantity", "where", *_AGREED),
-            tuple(row for row in rows if row[2] not in tissues), "In all soft tissue, as above.",
-        ),
-    )  # fmt: skip
+        *((by_distance,) if one.bones else ()),
+    )
 
 
 def _rounded(row: Agreement | SkinDisplacement, first: int) -> tuple[float, ...]:

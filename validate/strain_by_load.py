@@ -48,6 +48,7 @@ class Strip:
     plane: Plane
     extent_mm: tuple[float, float, float, float]
     title: str
+    place: str  # that the slice goes through, in words
     image: FloatArray  # rows downward, columns to the right; 0 to 1
     outlines: tuple[BoolArray, ...]
     max_shear: Mapping[str, Float32Array]  # by model, and of `MEASURED`; NaN where undefined
@@ -74,6 +75,7 @@ class Strip:
         masks = labels.labels > 0, np.isin(labels.labels, bones)
         return cls(
             one.load, plane, view.extent_mm(plane), view.title(plane),
+            "the lowest point of the bone" if one.bones else "the middle of the mesh",
             levelled(view.cut(shown, plane), window_of(view, shown)),
             tuple(view.cut(mask, plane) for mask in masks), pages,
         )  # fmt: skip

@@ -130,7 +130,8 @@ def write_fields(path: Path, one: LoadComparison) -> None:
     mapped, arrays = one.fields, dict[str, list[FloatArray]]()
     for name, field in mapped.by_name.items():
         arrays |= {f"{name}_max_shear": [field.max_shear], f"{name}_u_mm": [field.u_mm]}
-    arrays |= {"to_bone_mm": [mapped.to_bone_mm], "compared": [mapped.common.astype(np.float64)]}
+    arrays |= {"to_bone_mm": [mapped.to_bone_mm]} if one.bones else {}
+    arrays["compared"] = [mapped.common.astype(np.float64)]
     mesh = meshio.Mesh(mapped.mesh.points_mm, [("tetra", mapped.mesh.cells)], cell_data=arrays)
     with whole_file(path) as part:
         meshio.vtu.write(part, mesh, binary=True)

@@ -51,6 +51,10 @@ class ErrorBars:
         return lines + [f"Error bars: {self.of_twin}"] * bool(self.of_twin)
 
 
+NO_ERROR_BARS = ErrorBars(None, "A repeat scan has none: its strain is the error.")
+"""Those of a repeat scan."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TwinCheck:
     """What came back from the pair's twin, a synthetic warp of the unloaded image, or why nothing did."""

@@ -18,7 +18,7 @@ from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, Mask
 from dvc.io import result_folder as files
 from dvc.measurement import judgement, page
-from dvc.measurement.error_bars import ErrorBars, error_bars
+from dvc.measurement.error_bars import NO_ERROR_BARS, ErrorBars, error_bars
 from dvc.measurement.judgement import Evidence, Source
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
@@ -65,6 +65,8 @@ class Measurement:
         What it was made from; None if read from a folder.
     shown_mm : (3,) or None
         Point where the slices in figures meet, LPS mm: the lowest point of the bone; None: the middle of the tissue.
+    is_repeat : bool
+        Whether it is of a repeat scan, whose strain is the noise floor.
 
     Examples
     --------
@@ -94,6 +96,7 @@ class Measurement:
     image: Image | None = None
     source: Source | None = None
     shown_mm: FloatArray | None = None
+    is_repeat: bool = False
 
     @classmethod
     def from_registration(
@@ -114,13 +117,15 @@ class Measurement:
         with ThreadPoolExecutor(1) as pool:
             carried = pool.submit(judgement.carried_images, found)
             maps = judgement.maps_of(found)
-            bars, images = error_bars(found, subject, maps, more.error_model, more.twin), carried.result()
+            bars = NO_ERROR_BARS if is_repeat else error_bars(found, subject, maps, more.error_model, more.twin)
+            images = carried.result()
         if is_repeat:
             more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
         quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
         regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
         source, at = Source(subject, found.tissue, found, images), subject.lowest_bone_point_mm
-        return cls(name, found.deformation, maps, alignment, quality, regions, bars, found.reference, source, at)
+        figures = found.deformation, maps, alignment, quality, regions, bars, found.reference, source, at, is_repeat
+        return cls(name, *figures)
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Self:
@@ -188,7 +193,8 @@ class Measurement:
             deformation: Deformation = Within(files.spline_in(place), mask, margin_voxels=0)
         else:
             deformation = files.ResultFolder(place).deformation()
-        return cls(place.resolve().name, deformation, maps, alignment, quality, regions, bars, image, None, at)
+        name, figures = place.resolve().name, (deformation, maps, alignment, quality, regions, bars, image, None, at)
+        return cls(name, *figures, is_repeat=name == files.REPEAT)
 
     @property
     def verdict(self) -> Verdict:
@@ -240,8 +246,13 @@ class Measurement:
             f"{self.name}: {self.verdict.words}.",
             *(f"    {reason}" for reason in self.verdict.reasons),
             f"    {self.strain_line}",
-            *(f"    {line}" for line in self.error_bars.summary),
+            *(f"    {line}" for line in self._of_error_bars),
         ]
+
+    @property
+    def _of_error_bars(self) -> list[str]:
+        """Why there are no error bars, and what the twin did to them; a repeat scan needs none."""
+        return [] if self.is_repeat else self.error_bars.summary
 
     def __str__(self) -> str:
         return "\n".join(self.summary())
@@ -294,14 +305,17 @@ class Measurement:
     def _repr_html_(self) -> str:
         picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
         table = page.summary_table(self.regions, self.intervals)
-        return notebook_html(self.name, picture, table, verdict=self.verdict, notes=self.error_bars.summary)
+        return notebook_html(self.name, picture, table, verdict=self.verdict, notes=self._of_error_bars)
 
     def section(self, pictures: Mapping[str, Picture]) -> Section:
         """Its part of a report."""
         found, bars = None if self.source is None else self.source.registration, self.error_bars
-        notes = " ".join(filter(None, ["" if found is None else found.settings.engine.note, *bars.summary]))
+        weights = [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
+        engine = "" if found is None else found.settings.engine.note
+        fixed = page.FIXED_WEIGHTS if weights and self.is_repeat else ""
+        notes = " ".join(filter(None, [engine, fixed, *self._of_error_bars]))
         tables = [replace(page.key_figures(self.quality, self.alignment), note=notes), page.region_table(self.regions)]
-        tables += [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
+        tables += [] if self.is_repeat else weights
         tables += page.error_tables(bars)
         first = [pictures[stem] for stem in ("strain", "curves")]
         others = [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]

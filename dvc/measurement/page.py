@@ -24,6 +24,8 @@ STRAIN = "Maximum shear strain"
 """Title of the picture of the strain."""
 SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
 """Upper ends of the colours for maximum shear strain and its standard deviation."""
+FIXED_WEIGHTS = "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
+"""In place of the table of weights, for a repeat scan."""
 _TWIN = (
     "The unloaded image was warped by the measured displacement, fresh noise was added, and the pair was registered "
     "like the real one. Its true strain is the measured strain above, so the table shows the error that the noise and "
@@ -50,7 +52,9 @@ def drawings_of(
         drawn["checkerboard"] = Drawing.of("Checkerboard", figures.checkerboard, *pair)
         drawn["similarity"] = Drawing.of("Local similarity of the images", figures.similarity_slices, *local)
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
-    through = "Slices through the lowest point of the bone along the plate normal."
+    through = "Slices through the middle of the tissue."
+    if bone is not None:
+        through = "Slices through the lowest point of the bone along the plate normal."
     shear = Drawing.of(STRAIN, figures.strain_slices, *strain, note=through)
     if images is not None:
         both = {"unloaded": reference, "loaded, registered": Image(reference.grid, images.registered)}
@@ -78,14 +82,15 @@ def _curve_columns(maps: StrainMaps, labels: LabelMap) -> Columns:
 
 def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     """The figures that the verdict is based on."""
-    rows = [("Rotation of the bone between the scans", alignment["rotation_deg"], "degrees")]
+    held = "body" if alignment.get("on") == "image" else "bone"
+    rows = [(f"Rotation of the {held} between the scans", alignment["rotation_deg"], "degrees")]
     if "bone_shift_lps_mm" in alignment:
-        spread = "Spread of the rigid alignment between halves of the bone (rms over the bone; largest of six pairs)"
+        spread = f"Spread of the rigid alignment between halves of the {held} (rms over it; largest of six pairs)"
         spacing = " x ".join(f"{s:.3g}" for s in alignment["control_spacing_mm"])
         rows += [
-            ("Shift of the bone between the scans", float(np.linalg.norm(alignment["bone_shift_lps_mm"])), "mm"),
-            ("Correlation in and around the bone, before alignment", alignment["similarity_before"], ""),
-            ("Correlation in and around the bone, after alignment", alignment["similarity"], ""),
+            (f"Shift of the {held} between the scans", float(np.linalg.norm(alignment["bone_shift_lps_mm"])), "mm"),
+            (f"Correlation in and around the {held}, before alignment", alignment["similarity_before"], ""),
+            (f"Correlation in and around the {held}, after alignment", alignment["similarity"], ""),
             (spread, alignment["repeatability_rms_mm"], "mm"),
             ("Engine of the non-rigid registration", alignment["engine"], ""),
             ("Control point spacing of the B-spline", spacing, "mm"),
@@ -95,9 +100,12 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
         rows += [(f"Local similarity in the tissue, {said}", float(value), "") for said, value in each]
         rows.append(("Highest local similarity that noise as in the air allows, about", quality.most_similarity, ""))
     bone = "in the bone, before it was made rigid" if quality.bone_held else "in the bone"
+    if held == "bone":
+        rows += [
+            (f"Apparent displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
+            (f"Apparent maximum shear strain {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
+        ]
     rows += [
-        (f"Apparent displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
-        (f"Apparent maximum shear strain {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
         ("Folded voxels (det F <= 0)", quality.folded_voxels, "voxels"),
         ("Lowest det F", quality.lowest_jacobian, ""),
         ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),

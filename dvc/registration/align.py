@@ -205,7 +205,7 @@ def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highe
     inverted = max((score for score, _ in tries), default=0.0)
     found = "no position in the loaded image matches it"
     if np.isfinite(score):
-        found = f"the best normalised correlation around it is {score:.2f}"
+        found = f"the best correlation around it is {score:.2f}"
     told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
     if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
         return (
@@ -213,8 +213,8 @@ def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highe
             "share a frame."
         )
     return (
-        f"{told} Check that both images show the same body part, that the mask covers the bone on the unloaded image, "
-        "and that all of the bone is in the loaded image; or use --align image or --align none."
+        f"{told} Check that both images show the same body part, that the mask covers it, and that all of it is in "
+        "the loaded image; or use --align image or none."
     )
 
 

@@ -30,7 +30,7 @@ _LIMITS = {
         f"({{limits}}{_NOISIER}). The registration takes it for motion. Scan both with the same protocol, or remove "
         "the offset from the images."),
     "voxel_mm": (2.0, 5.0, 1, " mm", "Slices are {value} apart ({limits}). Strain across slices is hardly resolved, "
-        "and apparent strain appears where there is none. A repeat scan without load measures how much."),
+        "and apparent strain appears where there is none."),
     "bone_shift_mm": (0.3, 0.8, 2, " mm",
         "The bone, which is rigid, shows an apparent displacement of {value} (root mean square; {limits})."),
     "bone_shear_p95": (0.1, 0.25, 3, "", "The bone, which is rigid, shows an apparent maximum shear strain of {value} "
@@ -165,7 +165,8 @@ def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[V
     lacking, surely = (possible - after for possible in similarity.possible)
     findings += _judged("unlikeness", lacking, surely > _LIMITS["unlikeness"][1])
     findings += _judged("offset", quality.offset, similarity.offset[1] > _LIMITS["offset"][1])
-    findings += _judged("voxel_mm", slice_mm)
+    more = "" if quality.noise_floor is not None else " A repeat scan without load measures how much."
+    findings += [Verdict(one.level, (f"{one.reasons[0]}{more}",)) for one in _judged("voxel_mm", slice_mm)]
     if after < rigid - 0.01:
         told = "The non-rigid registration made the images less similar: local similarity fell from"
         findings.append(Verdict("distrust", (f"{told} {rigid:z.2f} to {after:z.2f}.",)))

@@ -91,7 +91,7 @@ class ErrorModel:
     def table_for(self, spacing_mm: FloatArray, snr: float) -> ErrorTable:
         """The closest table to a voxel (3,) mm and an SNR: sorted edges and SNR each within a factor of 1.6.
 
-        InputError if no table is that close; the message lists all.
+        InputError if no table is that close; the message gives the closest.
         """
         edges = np.sort(spacing_mm)
 
@@ -101,12 +101,11 @@ class ErrorModel:
 
         nearest = min(self.tables, key=far)
         if not far(nearest) <= np.log(_FAR):
-            known = "; ".join(f"{_told(t.spacing_mm)} mm at SNR {t.snr:.0f}" for t in self.tables)
             raise InputError(
-                f"The error of {self.preset} is known for voxels of {known}. These images, with voxels of "
-                f"{_told(spacing_mm)} mm at SNR {snr:.0f}, are too far from all of these. Measure the error with "
-                f"`mrstrain accuracy --preset {self.preset}` (--spacing, --slice-spacing, --snr), and pass the file "
-                "that it writes: error_model (--error-model on the command line)."
+                f"The error of {self.preset} is not known for voxels of {_told(spacing_mm)} mm at SNR {snr:.0f}: the "
+                f"closest known, {_told(nearest.spacing_mm)} mm at SNR {nearest.snr:.0f}, is too far. Measure it with "
+                f"`mrstrain accuracy --preset {self.preset}` (--spacing, --snr); give its file as "
+                "error_model (--error-model)."
             )
         return nearest
 

@@ -4,6 +4,7 @@ import ctypes
 import logging
 import signal
 import sys
+import textwrap
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
@@ -22,6 +23,7 @@ mrstrain measures strain inside soft tissue from pairs of MR images, and compare
   mrstrain compare    compare finite-element models with the strain that was measured
 
 mrstrain --help lists all commands, and mrstrain COMMAND --help the options of one."""
+_WIDTH = 100  # of a line of an error
 _M_ARENA_MAX = -8  # of glibc's malloc.h
 
 app = typer.Typer(
@@ -111,5 +113,20 @@ def _share_arenas() -> None:
 
 
 def _stop(message: str) -> None:
-    typer.echo(f"mrstrain: {message}", err=True)
+    typer.echo(wrapped(f"mrstrain: {message}"), err=True)
     sys.exit(2)
+
+
+def wrapped(message: str) -> str:
+    """A message in lines of at most 100 characters, broken between words; paths and options are kept in one piece.
+
+    Its own lines stay; what one of them is indented by, its continuation is as well.
+    """
+    lines = list[str]()
+    for line in message.splitlines():
+        indent = line[: len(line) - len(line.lstrip())]
+        broken = textwrap.wrap(
+            line, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+        )  # fmt: skip
+        lines += broken or [""]
+    return "\n".join(lines)

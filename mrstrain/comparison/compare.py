@@ -12,6 +12,7 @@ from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
+from dvc.measurement.subject import is_bones_name
 from dvc.report.page import Section
 from dvc.threads import usable_cores
 from dvc.worker import side_by_side
@@ -24,7 +25,7 @@ from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
 
 _BYTES_OF_A_LOAD = 1 << 30  # approximate memory of the process that compares one load
@@ -74,7 +75,7 @@ def compare(
     labelling, reading, directions, comparison
         Their fields are given as keywords, such as ``strains=...``.
     progress : callable, optional
-        ``progress(case, stage, fraction)``.
+        ``progress(case, stage, fraction)``; the case "note" first tells what was taken from the record.
 
     Raises
     ------
@@ -85,12 +86,20 @@ def compare(
     target, tell, measurements = Path(out), progress or (lambda *_: None), result_folders(Path(dvc), loads)
     labelling, labels_given = fill_labels(labelling, measurements), labelling
     assert labelling.labels is not None
-    tissues, bones = read_labels(labelling.labels, labelling.names), labelling.bones or (BONE,)
-    thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
-    criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     usual, of_load = fill_directions(directions, measurements)
     more = [f"(and the plate's directions of {', '.join(of_load)})"] if of_load else []
     taken = taken_from_record(Path(dvc), (labels_given, labelling), (directions, usual), more=more)
+    for line in taken:  # now, so that a wrong file is noticed before an hour is spent on it
+        tell(NOTE, line, 0.0)
+    tissues = read_labels(labelling.labels, labelling.names)
+    bones = labelling.bones or _usual_bones(tissues)
+    if not bones:
+        names = ", ".join(tissues.names.values())
+        tell(
+            NOTE, f"No label is called bone: {names} are compared as soft tissue. Name a bone among them (--bone).", 0.0
+        )
+    thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
+    criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     pairs = {load: (of.plate_normal, of.shear_direction) for load, of in of_load.items()} | dict(towards or {})
     axes, own = _axes(usual.plate_normal, usual.shear_direction), {load: _axes(*of) for load, of in pairs.items()}
     files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], reading, to_image)
@@ -131,6 +140,13 @@ def compare(
         parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
     share(1.0)
     return Compared(target, result, *parts, taken)
+
+
+def _usual_bones(labels: LabelMap) -> tuple[str, ...]:
+    """The bone of a label map where none is named: "bone", or none where the name of every label is of soft tissue."""
+    names = labels.names.values()
+    unclear = BONE in names or any(is_bones_name(name) or name.startswith("label-") for name in names)
+    return (BONE,) if unclear else ()
 
 
 def _at_once(loads: int) -> int:

@@ -20,7 +20,7 @@ from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.measured_with import MeasuredWith
 from mrstrain.records.outcome import Outcome
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
@@ -67,6 +67,8 @@ def level(
         raise InputError(f"{place} is not a folder with the results of a model (one file for each load).")
     if holds_results(load0):
         load0, subject_files, engine, taken = _from_record(load0, subject_files, engine)
+    for line in taken:  # now, so that a wrong file is noticed before an hour is spent on it
+        (progress or (lambda *_: None))(NOTE, line, 0.0)
     # Incompressibility is always enforced: the displacement extrapolated outside the model's mesh is not isochoric.
     volume = volume_kept(engine)
     how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
@@ -97,7 +99,7 @@ def level(
         else:
             _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
-        raise RegistrationError(" ".join(failures))
+        raise RegistrationError("\n".join(failures))
     told = f"Levelled model, for compare: {target / name}"
     return Outcome(target / name, (*taken, *notes, *smoothed, *failures, told))
 
@@ -120,8 +122,8 @@ def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int)
     """The unloaded image warped by each result, with fresh noise; and notes on results that were smoothed for it."""
     if subject.bone is None:
         raise InputError(
-            "A forward-model comparison needs the bone, in which the displacement is zero: give its mask (bone), or a "
-            "label map and the name of its label (labels, bone_label)."
+            "A forward-model comparison needs the bone, in which the displacement is zero. Give its mask as bone "
+            "(--bone), or a label map and the name of its label as labels and bone_label (--labels, --bone-label)."
         )
     images, notes = {}, []
     body = subject.tissue or tissue_mask(subject.reference)

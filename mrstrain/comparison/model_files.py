@@ -15,6 +15,7 @@ from dvc.errors import ExtentError, InputError
 from dvc.mesh import box_told
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import read_matrix
+from mrstrain.records.outcome import with_reasons
 from validate import FeResult, check_overlap, read_result
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
@@ -80,7 +81,7 @@ def model_files(
                     )
     files = {load: of for load, of in files.items() if of}
     if not files:
-        raise InputError("No model has a complete result for a measured load. " + " ".join(notes))
+        raise InputError(with_reasons("No model has a complete result for a measured load.", notes))
     return files, notes
 
 

@@ -26,6 +26,7 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.options.model import Flag
 from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
+from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
@@ -70,16 +71,13 @@ def register(
         if subject_files.labels is not None:
             raise InputError(
                 "The images are aligned on a rigid bone, and none is given.\n"
-                f"Name the label of the bone in {subject_files.labels.name}, or pass a mask of it: bone_label or bone "
-                "(--bone-label, --bone).\n"
-                "If the images show no bone, use align image (--align image)."
+                f"Name the label of the bone in {subject_files.labels.name}, bone_label (--bone-label), or give its "
+                "mask, bone (--bone). If the images show no bone, use align image (--align image)."
             )
         raise InputError(
-            "The images are aligned on a rigid bone, and none is given.\n"
-            f"In ITK-SNAP or 3D Slicer, segment the bone of the body part (in a heel, the calcaneus) on {load0.name}, "
-            "save it as NIfTI, and pass it as bone (--bone); or pass a label map and the name of its bone, as labels "
-            "and bone_label (--labels, --bone-label).\n"
-            "If the images show no bone, use align image (--align image)."
+            f"The images are aligned on a rigid bone, and none is given. Segment it on {load0.name} (in a heel, the "
+            "calcaneus) in ITK-SNAP or 3D Slicer, and pass the NIfTI file as bone (--bone), or a label map with it "
+            "(--labels, --bone-label). If there is no bone, use align image (--align image)."
         )
     at_once, threads = running.shares(1 if registration.chain else len(cases))
     with nullcontext(worker) if worker else Worker(threads) as first:
@@ -224,8 +222,8 @@ class _Run:
     def finished(self) -> tuple[Case, ...]:
         """The loads that were registered, in the order given; RegistrationError where none was."""
         if not self.cases:
-            reasons = " ".join(f"{name}: {reason}" for name, reason in self.failures.items())
-            raise RegistrationError(f"No load could be registered. {reasons}")
+            reasons = [f"{name}: {reason}" for name, reason in self.failures.items()]
+            raise RegistrationError(with_reasons("No load could be registered.", reasons))
         return tuple(self.cases[name] for name in self.images if name in self.cases)
 
     def _told(self, case: str, stage: str, fraction: float) -> None:

@@ -22,6 +22,7 @@ from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 
@@ -116,7 +117,7 @@ def simulate(
     run = _Run(target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
     each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
-        raise MrstrainError("Every simulation failed. " + " ".join(f"{n}: {r}" for n, r in run.failures.items()))
+        raise MrstrainError(with_reasons("Every simulation failed.", [f"{n}: {r}" for n, r in run.failures.items()]))
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
 
 

@@ -38,7 +38,7 @@ class ComparisonLabels(Options):
     """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, without --labels."""
     bones: Annotated[Names, Cli("--bone")] = ()
     """Name of a bone label, which is not compared; slices in figures go through the lowest point of the first bone.
-    Default: the bone label of the measurement, without --labels; else bone."""
+    Default: the bone label of the measurement, without --labels; else bone, if any label is of bone."""
 
 
 class Finer(NamedTuple):

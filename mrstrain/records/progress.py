@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
@@ -13,11 +14,15 @@ from rich.text import Text
 OnProgress = Callable[[str, str, float], None]
 """``progress(case, stage, fraction)``: what is being done for which case, and how far it is (0 to 1).
 
-A stage of a study is a case; when it has ended (1), what it found stands in the place of what is being done.
+A stage of a study is a case; when it has ended (1), what it found stands in the place of what is being done. What a
+person should know at once is told as the case "note".
 """
 
 ALL = "all"
 """The case that stands for a whole study, or several; its fraction is the share of the time, spent and to come."""
+
+NOTE = "note"
+"""The case of a sentence to be shown at once, as it stands in the place of the stage; its fraction is 0."""
 
 _LINE_EVERY_S = 15.0
 _LINE_OF_ALL_EVERY_S = 60.0
@@ -33,12 +38,19 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
     each part that has ended, and one every minute between.
     """
     console = console or Console(stderr=True)
+
+    def shown(others: OnProgress, case: str, stage: str, fraction: float) -> None:
+        if case == NOTE:
+            console.print(stage, markup=False, highlight=False, soft_wrap=True)
+        else:
+            others(case, stage, fraction)
+
     try:
         if console.is_terminal:
             with _bars(console, of_all) as progress:
-                yield progress
+                yield partial(shown, progress)
         else:
-            yield _lines_of_all() if of_all else _lines()
+            yield partial(shown, _lines_of_all() if of_all else _lines())
     except KeyboardInterrupt:
         console.print("Interrupted. Finished results are kept; incomplete ones are not.")
         raise

@@ -14,6 +14,7 @@ from dvc.report.drawing import Drawing
 from dvc.report.page import Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.records.inputs import make_output
+from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
@@ -94,9 +95,8 @@ def cohort(
     without = {name: why for name, one in by_name.items() if (why := _uncounted(one))}
     areas = {name: _areas(one.study.out) for name, one in by_name.items() if name not in without}
     if not any(areas.values()):
-        raise InputError(
-            "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
-        )
+        lines = [line for one in ran for line in one.summary()]
+        raise InputError(with_reasons("No subject was compared with a model.", lines))
     shares, notes = _shares(areas)
     notes = [f"{name} is left out: {why}" for name, why in without.items()] + notes
     notes += unlike([by_name[name].study for name in areas])

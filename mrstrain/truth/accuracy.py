@@ -15,6 +15,7 @@ from dvc.software import software_key
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
 from mrstrain.records.inputs import make_output, refuse_small_disk
+from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 from mrstrain.truth.accuracy_study import AccuracyStudy
 from phantoms import AccuracyCase, ErrorSamples, Heel, heel_grid, measure_run, motion_named
@@ -112,7 +113,7 @@ def accuracy(
         )
     failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
     if not runs:
-        raise MrstrainError("No case could be measured. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
+        raise MrstrainError(with_reasons("No case could be measured.", [f"{n}: {r}" for n, r in failures.items()]))
     return AccuracyStudy.of(target, [runs[name] for name in sorted(runs)], failures)
 
 

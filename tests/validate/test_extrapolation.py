@@ -140,14 +140,16 @@ def test_levelling_takes_image_bone_and_engine_from_the_measurement(
     stages = [{"name": "heel-mr", "text": load_preset("heel-mr").text}]
     record = provenance("register", given, {"engine": "elastix", "stages": stages})
     (measured / "provenance.json").write_text(json.dumps(record))
-    asked = []
+    asked, said = [], list[tuple[str, str, float]]()
 
     def registers(load0: Path, _: object, *, out: Path, **options: object) -> None:
+        assert said  # what was taken from the record, before the work begins
         asked.append((load0, options["subject_files"], options["registration"]))
         shutil.copytree(measured, out / "Load1")
 
     monkeypatch.setattr("mrstrain.comparison.level.register", SimpleNamespace(with_options=registers))
-    done = level(measured.parent, folder / "model", out=folder / "out")
+    done = level(measured.parent, folder / "model", out=folder / "out", progress=lambda *told: said.append(told))
+    assert said == [("note", done.lines[0], 0.0)]
     ((load0, files, how),) = asked
     assert (load0, files, how.preset) == (given["load0"], SubjectFiles(bone=given["bone"]), "heel-mr")
     told = json.loads((done.out / "provenance.json").read_text())

@@ -204,6 +204,9 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
     table(files["path"], TAGS, 1000.0 * moved(points))
     with pytest.raises(InputError, match="largest displacement"):
         read_result("heel", files["path"], mesh=files["mesh"])
+    table(files["path"], TAGS, 0.0 * moved(points))
+    with pytest.raises(InputError, match="0 everywhere, as in the unloaded state"):
+        read_result("heel", files["path"], mesh=files["mesh"])
     whole = written(tmp_path, "frd")["path"]
     text = whole.read_text()
     for end in range(200, len(text) - 40, len(text) // 25):

@@ -217,13 +217,13 @@ def _pick_stack(place: Path, stacks: dict[str, _Stack], series: str | None) -> _
         lines[_LISTED:] = [f"  and {len(lines) - _LISTED} more, named in the same way"]
     what, move = "file", "Write one image"
     if place.is_dir():
-        what, move = "folder", "Move the files of one image to a folder of its own, or write it"
+        what, move = "folder", "Move one image to its own folder, or write it"
     problem = f"series='{series}' matches {len(matching)} of the DICOM series in this {what}"
     if series is None:
         several = len({stack.series for stack in stacks.values()})
         problem = f"the {what} has {f'{several} DICOM series' if several > 1 else _SEVERAL}, but one image is needed"
     raise InputError(
         f"{place}: {problem}. {move} to a file in Python: "
-        f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)), with a NAME from this list:\n'
+        f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)), with a NAME of these:\n'
         + "\n".join(lines)
     )

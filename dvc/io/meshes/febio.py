@@ -27,9 +27,11 @@ _DOMAINS, _PARTS = 0x01042000, 0x01045000
 _KIND, _PART = (0x01042101, 0x01042102), (0x01042101, 0x01042103)
 _ELEMENTS, _ELEMENT = 0x01042200, 0x01042201
 _PART_ID, _PART_NAME = 0x01045101, 0x01045102
-_NODE_DATA, _STATUS = (0x02020000, 0x02020300), (0x02010000, 0x02010003)
+_NODE_DATA, _TIME, _STATUS = (0x02020000, 0x02020300), (0x02010000, 0x02010002), (0x02010000, 0x02010003)
+_NO_STEPS_END = 2  # status of a state that is written at another event: an iteration, or the end of the run
 _VARIABLE_ID, _VARIABLE_DATA = 0x02020002, 0x02020003
 _DISPLACEMENT = "displacement"
+_WHOLE = 1e-3  # of a time that is taken as whole
 
 # Of FEBio's number of the element type: nodes in the file, and the kind in meshio's names with those that are taken.
 # Bricks of 27 and tetrahedra of 15 nodes begin with the nodes of those of 20 and 10.
@@ -48,14 +50,17 @@ def read_xplt(path: Path) -> RawMesh:
         if len(data) < 4 or struct.unpack_from("<I", data)[0] != _MAGIC:
             raise ImageFileError(f"{path}: not a FEBio plot file.")
         last: dict[int, bytes] = {}
+        before = b""  # the state before the last one
         for tag, body in _sections(data):
             if tag == _MESH and tag in last:
                 raise ImageFileError(f"{path}: the mesh changes between states (remeshing), which is not supported.")
+            before = last.get(tag, b"") if tag == _STATE else before
             last[tag] = body
         if _ROOT not in last or _MESH not in last:
             raise ImageFileError(f"{path}: the file is incomplete; it has no mesh.")
         points, ids = _nodes(last[_MESH])
-        fields = _displacement(path, last[_ROOT], last[_STATE], len(points)) if _STATE in last else {}
+        fields = _displacement(last[_ROOT], last[_STATE], len(points)) if _STATE in last else {}
+        _tell_early_end(path, before, last.get(_STATE, b""))
         return RawMesh(path, points, ids, *_cells(path, last[_MESH]), at_nodes=fields)
 
 
@@ -137,11 +142,25 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
     return blocks, {name: np.concatenate(cells) for name, cells in parts.items()}
 
 
-def _displacement(path: Path, root: bytes, state: bytes, count: int) -> dict[str, FloatArray]:
+def _tell_early_end(path: Path, before: bytes, state: bytes) -> None:
+    """Warn of a last state that may be none at the end of a run, by its time, or by the state before it.
+
+    The file has neither the time at which a run should end nor whether it did; runs end at whole times as a rule.
+    """
+    time, status = _at(state, *_TIME), _at(state, *_STATUS)
+    reached = struct.unpack("<f", time)[0] if time else 0.0
+    if abs(reached - round(reached)) > _WHOLE:
+        _log.warning("%s: the last state is that of time %.4g; check that the run reached its end.", path, reached)
+    if time and time == _at(before, *_TIME) and status and _number(status) == _NO_STEPS_END:
+        _log.warning(
+            "%s: its states are written in every iteration (PLOT_MINOR_ITRS), so the last one may not be converged; "
+            "check the run, or set plot_level to PLOT_MAJOR_ITRS.",
+            path,
+        )
+
+
+def _displacement(root: bytes, state: bytes, count: int) -> dict[str, FloatArray]:
     """Displacement in a state, (n, 3), by its name; empty where it has none."""
-    status = _at(state, *_STATUS)
-    if status and _number(status):
-        _log.warning("%s: the last state has FEBio error status %d; check the run.", path, _number(status))
     names = [_text(_at(item, _ITEM_NAME)) for tag, item in _chunks(_at(root, *_NODAL_NAMES)) if tag == _ITEM]
     wanted = names.index(_DISPLACEMENT) + 1 if _DISPLACEMENT in names else None
     for _, variable in _chunks(_at(state, *_NODE_DATA)):

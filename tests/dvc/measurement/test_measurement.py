@@ -17,11 +17,14 @@ from matplotlib.figure import Figure
 import dvc
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.io import result_folder as files
+from dvc.measurement.page import key_figures
 from dvc.registration.register import Settings
+from dvc.report.page import Picture
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
 from dvc.trust.twin_judgement import Judged
 
 GRID = dvc.Grid((14, 16, 18), (1.5, 1.2, 1.0), (-8.0, 3.0, 5.0))
+PNG = b"\x89PNG\r\n\x1a\n"
 ATTACK = "<script>alert('x')</script>"
 
 
@@ -162,6 +165,41 @@ def test_landmarks_are_taken_as_they_are_read(tiny_pair, worker):
     one = dvc.measure(tiny_pair.reference, tiny_pair.repeat, settings=settings, **given)
     assert one.quality.landmark_errors_mm is not None
     assert one.quality.landmark_errors_mm.size == 1
+
+
+def test_a_repeat_scan_has_what_applies_to_it_alone(tiny_pair, measured, worker):
+    """Its weights are fixed and its strain is the error itself: no table of weights, no error bars, no reason why."""
+    subject = dvc.Subject(tiny_pair.reference, tiny_pair.bone)
+    how = Settings.of("gauss-newton").of_repeat()
+    found = dvc.register(tiny_pair.reference, tiny_pair.repeat, bone=tiny_pair.bone, settings=how, worker=worker)
+    evidence = dvc.Evidence(error_model=measured.error_bars.model)
+    loaded, repeat = (
+        dvc.Measurement.from_registration(found, subject, evidence, name=name, is_repeat=name == "repeat")
+        for name in ("Load1", "repeat")
+    )
+    sections = [one.section(dict.fromkeys(("strain", "curves"), Picture("", "", PNG))) for one in (loaded, repeat)]
+    titles = [[table.title for table in section.tables] for section in sections]
+    assert set(titles[0]) - set(titles[1]) >= {"Regularisation weights"}
+    assert set(titles[1]) == {"Key figures", "Maximum shear strain by region"}
+    (note,) = [table.note for table in sections[1].tables if table.title == "Key figures"]
+    assert (
+        note == "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
+    )
+    assert "error bars" not in str(repeat).lower()
+    assert [("A repeat scan without load" in str(one)) for one in (loaded, repeat)] == [True, False]
+    assert repeat.sigma is None
+    assert repeat.error_bars.as_dict() == {"known": False, "reason": "A repeat scan has none: its strain is the error."}
+    assert any("Noise floor" in str(row[0]) for row in sections[1].tables[0].rows)
+
+
+def test_images_that_were_aligned_as_a_whole_have_no_figures_of_a_bone(stretched):
+    moved = {"rotation_deg": 1.0, "bone_shift_lps_mm": [1.0, 0.0, 0.0], "similarity_before": 0.5, "similarity": 0.9}
+    moved |= {"repeatability_rms_mm": 0.1, "control_spacing_mm": [4.0, 4.0, 4.0], "engine": "gauss-newton"}
+    rows = {on: str(key_figures(stretched.quality, moved | {"on": on}).rows) for on in ("bone", "image")}
+    assert "Rotation of the bone" in rows["bone"]
+    assert "Rotation of the body" in rows["image"]
+    assert "bone" not in rows["image"]
+    assert stretched.drawings()["strain"].caption.endswith("Slices through the middle of the tissue.")
 
 
 def test_a_notebook_shows_the_verdict_a_picture_and_a_table_all_escaped(stretched):

@@ -18,6 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dvc.errors import GeometryError, InputError, OutputError
+from dvc.images.image import LabelMap
 from dvc.io.images.write import write_labels
 from dvc.io.result_folder import write_displacement
 from mrstrain.cli.app import app
@@ -301,7 +302,8 @@ def test_what_was_measured_with_is_not_asked_for_again(study: Path) -> None:
     argv = ["compare", load, study / "half" / "Load1.vtu", "--out", study / "one"]
     ran = CliRunner().invoke(app, [str(a) for a in argv])
     assert ran.exit_code == 0, ran.output
-    (taken,) = [line for line in ran.output.splitlines() if line.startswith(f"From the record of {load}: ")]
+    (taken,) = [line for line in ran.stdout.splitlines() if line.startswith(f"From the record of {load}: ")]
+    assert ran.stderr.splitlines()[0] == taken  # at the start, and again with the results
     assert f"--labels {files['labels']} --names {files['names']} --bone bone " in taken
     assert taken.endswith(" --plate-normal 1 0 0 --shear-direction 0 1 0")
     told = json.loads((study / "one" / "comparison.json").read_text())
@@ -335,3 +337,35 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(study: Path) ->
         with pytest.raises(error, match=message):
             compare(study / "measured", [right], **(given(study) | more))
     assert not list((study / "out").glob("*/*")) if (study / "out").exists() else True
+
+
+def test_tissue_without_bone_is_compared_and_its_report_leaves_out_what_needs_bone(study: Path) -> None:
+    with_errors(study, 0.0, 0.02)
+    tissues = labels()
+    soft = LabelMap(tissues.grid, np.where(tissues.labels == 3, 0, tissues.labels), {1: "fat", 2: "skin"})
+    write_labels(study / "tissues.nii.gz", soft)
+    (study / "tissues.csv").write_text("label,name\n1,fat\n2,skin\n")
+    told = list[tuple[str, str, float]]()
+    models = [study / "half", study / "right"]
+    done = compare(study / "measured", models, **given(study), progress=lambda *one: told.append(one))
+    assert [a.model for a in done.comparison.ranking.areas] == ["right", "half"]
+    assert told[0][0] == "note"
+    assert "No label is called bone: fat, skin are compared as soft tissue." in told[0][1]
+    (said,) = [note for note in done.comparison.notes if "no bone" in note]
+    assert "all of its labels (fat, skin) are compared as soft tissue" in said
+    # the error is known by distance to bone; without one it would be taken for that of tissue far away
+    assert np.isnan(done.comparison.ranking.areas[0].low_ml)
+    page = re.sub(r"\s+", " ", (study / "out" / "report.html").read_text())
+    assert "Agreement by distance to bone" not in page
+    assert "lowest point" not in page
+    assert "The slice goes through the middle of the mesh." in page
+    parts = {r["part"] for r in rows(study / "out" / "agreement.csv")}
+    assert not any("bone" in part for part in parts)
+    assert not any("bone" in part for part in meshio.read(study / "out" / "Load1" / "fields.vtu").cell_data)
+
+
+@pytest.mark.parametrize("names", ["1,fat\n2,Calcaneus\n", "1,fat\n2,label-2\n"])
+def test_bone_that_is_only_not_named_is_not_compared_as_soft_tissue(study: Path, names: str) -> None:
+    (study / "tissues.csv").write_text(f"label,name\n{names}3,upper\n")
+    with pytest.raises(InputError, match=r"no label 'bone'; its labels are .* Name its bones \(bones, --bone\)"):
+        compare(study / "measured", [study / "right"], **given(study))

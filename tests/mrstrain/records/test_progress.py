@@ -51,6 +51,20 @@ def test_cases_and_stages_have_clocks_of_their_own(clock: list[float], capsys: p
     ]
 
 
+@pytest.mark.parametrize("of_all", [False, True])
+def test_a_note_is_shown_at_once_and_in_one_line(of_all: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    words = "From the record of results: " + "--labels " + "a folder/" * 20
+    with progress.live(of_all=of_all) as told:
+        told(progress.NOTE, words, 0.0)
+        assert capsys.readouterr().err == f"{words}\n"
+    screen = io.StringIO()
+    with progress.live(of_all=of_all, console=Console(file=screen, force_terminal=True, width=80)) as told:
+        told(progress.NOTE, words, 0.0)
+        told("Load1", "registering", 0.5)
+    assert f"{words}\n" in screen.getvalue()
+    assert "note" not in screen.getvalue()
+
+
 def test_of_many_stages_a_pipe_gets_a_line_for_each_that_ended_with_the_time_left(
     clock: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -40,9 +40,10 @@ def domain(kind: int, part: int, cells: np.ndarray) -> bytes:
 
 
 def sections(
-    points: np.ndarray, domains: list[bytes], u: np.ndarray, packed: bool = False, variable: str = "displacement"
-) -> list[bytes]:
-    """Root, mesh of two parts, two states of which the last counts; a nodal variable stands before the displacement."""
+    points: np.ndarray, domains: list[bytes], u: np.ndarray, packed: bool = False, variable: str = "displacement",
+    times: tuple[float, ...] = (0.5, 1.0), status: int = 0,
+) -> list[bytes]:  # fmt: skip
+    """Root, mesh of two parts, states of which the last counts; a nodal variable stands before the displacement."""
     items = [chunk(0x01020001, whole(0x01020002, 1), whole(0x01020003, 0), text(0x01020004, name))
              for name in ("velocity", variable)]  # fmt: skip
     header = chunk(0x01010000, whole(0x01010001, 0x0035), whole(0x01010004, int(packed)))
@@ -54,10 +55,10 @@ def sections(
     parts = [chunk(0x01045100, whole(0x01045101, n), text(0x01045102, name)) for n, name in ((1, "fat"), (2, "skin"))]
     mesh = chunk(0x01040000, node_part, chunk(0x01042000, *domains), chunk(0x01045000, *parts))
     states = []
-    for time in (0.5, 1.0):
+    for time in times:
         values = [chunk(0x02020001, whole(0x02020002, n), chunk(0x02020003, floats(0, field)))
                   for n, field in ((1, 9.0 * u), (2, time * u))]  # fmt: skip
-        state = chunk(0x02000000, chunk(0x02010000, floats(0x02010002, np.array([time]))),
+        state = chunk(0x02000000, chunk(0x02010000, floats(0x02010002, np.array([time])), whole(0x02010003, status)),
                       chunk(0x02020000, chunk(0x02020300, *values)))  # fmt: skip
         states.append(zlib.compress(state) if packed else state)
     return [struct.pack("<I", 0x00464542) + root, mesh, *states]
@@ -86,6 +87,34 @@ def test_tetrahedra_of_two_parts_and_a_shell(tmp_path: Path, packed: bool) -> No
     result = read_result("febio", path)
     np.testing.assert_allclose(result.deformation.u_mm, u, atol=1e-6)
     assert {name: len(found) for name, found in result.mesh.regions.items()} == {"fat": 20, "skin": 28}
+
+
+def test_a_file_whose_last_state_is_the_unloaded_one_is_no_result(tmp_path: Path) -> None:
+    points, cells = block()
+    path = write_xplt(tmp_path / "Load1.xplt", points, [domain(2, 1, cells)], 0.01 * points, times=(0.0,))
+    assert read_mesh(path).tets is not None  # as a mesh it serves
+    with pytest.raises(InputError, match=r"is 0 everywhere, as at time 0.*FEBio's log.*PLOT_MAJOR_ITRS"):
+        read_result("febio", path)
+
+
+@pytest.mark.parametrize(
+    ("times", "status", "words"),
+    [
+        ((0.0, 0.5, 1.0), 0, []),
+        ((0.0, 2.0), 2, []),  # of a run whose last state alone is written (PLOT_FINAL, plot_stride)
+        ((0.0, 0.1, 0.3), 0, ["the last state is that of time 0.3; check that the run reached its end"]),
+        ((0.0, 1.0, 1.0), 2, ["written in every iteration (PLOT_MINOR_ITRS)"]),
+    ],
+)
+def test_a_run_that_may_have_ended_early_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, times: tuple[float, ...], status: int, words: list[str]
+) -> None:
+    points, cells = block()
+    how = {"times": times, "status": status}
+    read_mesh(write_xplt(tmp_path / "Load1.xplt", points, [domain(2, 1, cells)], 0.01 * points, **how))
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(said) == len(words)
+    assert all(word in one for word, one in zip(words, said, strict=True))
 
 
 @pytest.mark.parametrize(
