@@ -96,6 +96,7 @@ def main() -> None:
     _share_arenas()
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    signal.signal(signal.SIGINT, _interrupted)
     try:
         app()
     except Exception as error:
@@ -104,6 +105,13 @@ def main() -> None:
         if not isinstance(error, MrstrainError):
             raise
         _stop(str(error))
+
+
+def _interrupted(*_: object) -> None:
+    """Say so before anything is taken down; a second interrupt ends the process at once."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    typer.echo("\nStopping. What is finished is kept.", err=True)
+    raise KeyboardInterrupt
 
 
 def _share_arenas() -> None:

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.errors import ExtentError, InputError
 from dvc.mesh import box_told
 from mrstrain.options.modelling import ModelReading
-from mrstrain.records.inputs import read_matrix
+from mrstrain.records.inputs import matrix_of, read_matrix
 from mrstrain.records.outcome import with_reasons
 from validate import FeResult, check_overlap, read_result
+from validate.run_end import early_end
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
 SETTINGS = "model.toml"
@@ -72,8 +71,15 @@ def model_files(
                 notes.append(f"{name} has no result for {load}.")
             elif reached.get(load, 0.0 if reached else 1.0) < 1.0:
                 notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}; this load is not compared.")
+            elif (end := early_end(chosen[load])) and end.certain and not usual.unfinished:
+                notes.append(
+                    f"{name}: the run of {load} {end.reason}; this load is not compared. To compare it all the same, "
+                    "use unfinished (--unfinished)."
+                )
             else:
                 files[load].append(ModelFile(name, chosen[load], *reading))
+                if end:
+                    notes.append(f"{name}: the run of {load} {end.reason}. Check that the load was reached.")
                 if stable.get(load, 1.0) < 1.0:
                     notes.append(
                         f"{name}, {load}: a material is not stable (Drucker) at the strain reached, in up to "
@@ -158,5 +164,6 @@ def _reading(
         own["model_mesh"] = folder / str(content["mesh"])
     if "to_image" in content:
         matrix = content["to_image"]
-        to_image = read_matrix(folder / matrix) if isinstance(matrix, str) else np.array(matrix, dtype=np.float64)
+        named = isinstance(matrix, str)
+        to_image = read_matrix(folder / matrix) if named else matrix_of(matrix, f"{folder / SETTINGS}, to_image")
     return usual.model_copy(update=own), to_image

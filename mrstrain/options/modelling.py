@@ -170,6 +170,8 @@ class ModelReading(Options):
     """Unit of the model coordinates."""
     model_frame: Frame = "LPS"
     """Frame of the model coordinates."""
+    unfinished: Flag = False
+    """Compare results of FEBio and CalculiX whose run ended early, too."""
 
 
 def _rising(strains: tuple[float, float]) -> tuple[float, float]:

@@ -50,12 +50,25 @@ def read_subject(
 def read_matrix(path: Path) -> FloatArray:
     """Read a 4 x 4 matrix from a text file of four rows; InputError for any other file."""
     try:
-        matrix = np.loadtxt(path)
+        return matrix_of(np.loadtxt(path), str(path))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a matrix of four rows of four numbers ({error}).") from error
+
+
+def matrix_of(rows: object, where: str) -> FloatArray:
+    """A homogeneous matrix (4, 4) of rows of numbers; InputError, naming ``where``, for anything else."""
+    try:
+        matrix = np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{where}: not a matrix of four rows of four numbers.") from error
     if matrix.shape != (4, 4):
-        raise InputError(f"{path}: the matrix has shape {matrix.shape}; 4 x 4 is needed.")
-    return np.asarray(matrix, dtype=np.float64)
+        raise InputError(f"{where}: the matrix has shape {matrix.shape}; 4 x 4 is needed.")
+    if not np.isfinite(matrix).all():
+        row, column = np.argwhere(~np.isfinite(matrix))[0] + 1
+        raise InputError(f"{where}: the number in row {row}, column {column} of the matrix is not finite.")
+    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(f"{where}: the last row of the matrix must be 0 0 0 1; it is {matrix[3].tolist()}.")
+    return matrix
 
 
 def image_stem(name: str) -> str:

@@ -7,11 +7,12 @@ import time
 import traceback
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import dask
+import psutil
 from distributed import Client, Future, LocalCluster, get_worker
 from filelock import FileLock
 
@@ -107,7 +108,11 @@ def cluster(
                 ) as local,
                 Client(local) as client,
             ):  # fmt: skip
-                yield StageRunner(client, watch)
+                try:
+                    yield StageRunner(client, watch)
+                except BaseException:
+                    _kill_workers(local)
+                    raise
             return
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
@@ -129,6 +134,16 @@ def cluster(
                 yield runner
             finally:
                 client.cancel(list(runner._under_way))
+
+
+def _kill_workers(local: LocalCluster) -> None:
+    """End the processes of a cluster and what they have started; Dask would wait for stages that do not listen."""
+    for nanny in local.workers.values():
+        nanny.auto_restart = False
+        with suppress(psutil.NoSuchProcess):
+            worker = psutil.Process(nanny.pid)
+            for process in (*worker.children(recursive=True), worker):
+                process.kill()
 
 
 def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:

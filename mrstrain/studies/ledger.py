@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -19,6 +19,26 @@ from mrstrain.studies.plan import Stage
 from mrstrain.studies.stages import StageResult
 
 _RECORD, _REASON = ".json", ".failed.txt"
+
+
+class FileState(NamedTuple):
+    """A file as a stage wrote it: size in bytes, time of the last change in ns, and hash of its contents."""
+
+    size: int
+    changed_ns: int
+    sha256: str
+
+    @classmethod
+    def of(cls, path: Path) -> Self:
+        """The state of a file."""
+        state = path.stat()
+        return cls(state.st_size, state.st_mtime_ns, file_hash(path))
+
+    def is_that_of(self, path: Path) -> bool:
+        """Whether a file has these contents; they are read only where its time is another, as after copying."""
+        if not path.is_file() or (state := path.stat()).st_size != self.size:
+            return False
+        return state.st_mtime_ns == self.changed_ns or file_hash(path) == self.sha256
 
 
 class StageRecord(BaseModel):
@@ -32,14 +52,20 @@ class StageRecord(BaseModel):
     key: str  # hash of all inputs
     made_utc: str
     seconds: float
-    files: dict[str, int]  # files that it wrote, relative to the results folder, with their sizes in bytes
+    files: dict[str, FileState]  # that it wrote, by their place in the results folder
     result: StageResult
     made_from: dict[str, Any] = {}  # hashes of its input files by name, and its arguments
+    checksum: str = ""  # of all the others, as `sealed` computes it
 
     @property
     def identity(self) -> str:
         """Identity for the stages that depend on it; a repeated stage gets a new identity, even with equal inputs."""
         return hashlib.sha256(f"{self.key} {self.made_utc}".encode()).hexdigest()
+
+    def sealed(self) -> Self:
+        """The same with its checksum."""
+        content = self.model_copy(update={"checksum": ""}).model_dump_json()
+        return self.model_copy(update={"checksum": hashlib.sha256(content.encode()).hexdigest()})
 
 
 class Ledger:
@@ -89,13 +115,15 @@ class Ledger:
         return self._hashes[version]
 
     def finished(self, stage: Stage) -> StageRecord | None:
-        """The record of a stage if all its files exist, whatever its inputs were; otherwise None."""
+        """The record of a stage if it and all its files are as they were written, whatever its inputs were."""
         try:
             record = StageRecord.model_validate_json(self._file(stage, _RECORD).read_bytes())
         except (OSError, ValidationError):
             return None
-        sizes = ((self.out / name, size) for name, size in record.files.items())
-        return record if all(place.is_file() and place.stat().st_size == size for place, size in sizes) else None
+        if record.checksum != record.sealed().checksum:
+            return None  # damaged: the stage is run again
+        whole = all(state.is_that_of(self.out / name) for name, state in record.files.items())
+        return record if whole else None
 
     def clear(self, stage: Stage, reason: str = "", *, files: bool) -> None:
         """Mark a stage as not finished, record the reason, and remove its files unless it can resume from them."""
@@ -127,12 +155,12 @@ class Ledger:
     ) -> StageRecord:
         """Record that a stage is finished."""
         made = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
-        files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in made if p.is_file()}
+        files = {p.relative_to(self.out).as_posix(): FileState.of(p) for p in made if p.is_file()}
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         record = StageRecord(
             stage=stage.name, key=key, made_utc=now, seconds=round(seconds, 1), files=files, result=result,
             made_from=dict(made_from),
-        )  # fmt: skip
+        ).sealed()  # fmt: skip
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self._file(stage, _RECORD), record.model_dump_json())
         return record

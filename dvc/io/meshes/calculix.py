@@ -18,6 +18,7 @@ _ORDER = {
     "wedge15": [*range(9), *range(12, 15), *range(9, 12)],
 }
 _NODE, _VALUE = 10, 12  # columns of a number of a node, and of a value
+_TIME, _ANALYSIS, _IN_TIME = slice(12, 24), slice(56, 58), (0, 1)  # of the head of results; static and transient
 
 
 def read_frd(path: Path) -> RawMesh:
@@ -25,7 +26,10 @@ def read_frd(path: Path) -> RawMesh:
     try:
         text = path.read_text(encoding="ascii")
     except (UnicodeDecodeError, OSError) as error:
-        raise ImageFileError(f"{path}: not an ASCII result file of CalculiX ({error}).") from error
+        raise ImageFileError(
+            f"{path}: not a text file. If it is a binary result of CalculiX, write it with *NODE FILE in place of "
+            "*NODE OUTPUT."
+        ) from error
     mesh = NumberedMesh(path)
     materials: dict[str, list[int]] = {}
     at_nodes: dict[str, dict[int, list[float]]] = {}
@@ -41,6 +45,16 @@ def read_frd(path: Path) -> RawMesh:
                 rows = [row for row in _rows(path, lines, "displacements") if row.startswith(" -1")]
                 at_nodes = {"displacement": {int(row[3:13]): _values(row) for row in rows}}
     return mesh.by_index(materials, at_nodes=at_nodes)
+
+
+def time_reached(path: Path) -> float | None:
+    """The latest time of a static or transient result in the file; None where it has none."""
+    times = []
+    with path.open("rb") as file, damage_named(f"{path}: a head of results"):
+        for line in file:
+            if line.startswith(b"  100C") and int(line[_ANALYSIS]) in _IN_TIME:
+                times.append(float(line[_TIME]))
+    return max(times, default=None)
 
 
 def _rows(path: Path, lines: Iterator[tuple[int, str]], block: str) -> list[str]:

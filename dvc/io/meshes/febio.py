@@ -31,7 +31,6 @@ _NODE_DATA, _TIME, _STATUS = (0x02020000, 0x02020300), (0x02010000, 0x02010002),
 _NO_STEPS_END = 2  # status of a state that is written at another event: an iteration, or the end of the run
 _VARIABLE_ID, _VARIABLE_DATA = 0x02020002, 0x02020003
 _DISPLACEMENT = "displacement"
-_WHOLE = 1e-3  # of a time that is taken as whole
 
 # Of FEBio's number of the element type: nodes in the file, and the kind in meshio's names with those that are taken.
 # Bricks of 27 and tetrahedra of 15 nodes begin with the nodes of those of 20 and 10.
@@ -60,7 +59,7 @@ def read_xplt(path: Path) -> RawMesh:
             raise ImageFileError(f"{path}: the file is incomplete; it has no mesh.")
         points, ids = _nodes(last[_MESH])
         fields = _displacement(last[_ROOT], last[_STATE], len(points)) if _STATE in last else {}
-        _tell_early_end(path, before, last.get(_STATE, b""))
+        _tell_iterations(path, before, last.get(_STATE, b""))
         return RawMesh(path, points, ids, *_cells(path, last[_MESH]), at_nodes=fields)
 
 
@@ -142,15 +141,17 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
     return blocks, {name: np.concatenate(cells) for name, cells in parts.items()}
 
 
-def _tell_early_end(path: Path, before: bytes, state: bytes) -> None:
-    """Warn of a last state that may be none at the end of a run, by its time, or by the state before it.
+def time_reached(path: Path) -> float | None:
+    """The time of the last state in a plot file; None where it has none."""
+    with damage_named(f"{path}: its sections"):
+        states = [body for tag, body in _sections(path.read_bytes()) if tag == _STATE]
+        time = _at(states[-1], *_TIME) if states else b""
+        return float(np.float32(struct.unpack("<f", time)[0])) if time else None
 
-    The file has neither the time at which a run should end nor whether it did; runs end at whole times as a rule.
-    """
+
+def _tell_iterations(path: Path, before: bytes, state: bytes) -> None:
+    """Warn of a last state that may not be converged, by the state before it."""
     time, status = _at(state, *_TIME), _at(state, *_STATUS)
-    reached = struct.unpack("<f", time)[0] if time else 0.0
-    if abs(reached - round(reached)) > _WHOLE:
-        _log.warning("%s: the last state is that of time %.4g; check that the run reached its end.", path, reached)
     if time and time == _at(before, *_TIME) and status and _number(status) == _NO_STEPS_END:
         _log.warning(
             "%s: its states are written in every iteration (PLOT_MINOR_ITRS), so the last one may not be converged; "

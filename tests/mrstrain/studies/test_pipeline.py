@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -131,6 +132,30 @@ def test_a_result_that_was_lost_is_made_again(folder):
     assert ran(folder)[0] == ["simulate b", "compare"]
     (folder / "results" / "register_a").write_text("cut")
     assert ran(folder)[0] == ["register a", "compare"]
+
+
+def test_a_result_that_was_damaged_is_made_again(folder):
+    """With as many bytes as before; a copy with another time and the same bytes is whole."""
+    ran(folder)
+    result = folder / "results" / "register_a"
+    content = result.read_bytes()
+    result.write_bytes(content)
+    os.utime(result, (1.0, 1.0))
+    assert ran(folder)[0] == []
+    result.write_bytes(content[:-2] + b"7]")
+    assert ran(folder)[0] == ["register a", "compare"]
+    assert result.read_bytes() == content
+
+
+@pytest.mark.parametrize(("right", "wrong"), [("1.0", "1e400"), ("a done", "b done"), ("{", "["), ("}", "")])
+def test_a_record_that_was_damaged_is_made_again(folder, right, wrong):
+    ran(folder)
+    record = folder / "results" / ".study" / "register a.json"
+    told = record.read_text()
+    assert right in told
+    record.write_text(told.replace(right, wrong))
+    assert ran(folder)[0] == ["register a", "compare"]
+    assert ran(folder)[0] == []
 
 
 def test_a_failure_is_named_and_the_others_finish(folder):

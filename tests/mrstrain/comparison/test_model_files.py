@@ -1,0 +1,47 @@
+"""Which files of a model are compared, and what is said of the others."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from dvc.errors import InputError
+from mrstrain.comparison.model_files import model_files
+from mrstrain.options.modelling import ModelReading
+from tests.validate.test_codes import CODES
+
+LOADS = ("Load1", "Load2")
+
+
+def model(place: Path, **runs: str) -> Path:
+    """A folder of a model with the results of runs in ``codes.zip``, and all that lies beside them, by load."""
+    place.mkdir()
+    with zipfile.ZipFile(CODES) as packed:
+        for load, run in runs.items():
+            for name in packed.namelist():
+                if name.startswith(f"{run}."):
+                    (place / f"{load}{Path(name).suffix}").write_bytes(packed.read(name))
+    return place
+
+
+@pytest.mark.parametrize(("failed", "why"), [("febio/fails", "ERROR TERMINATION"), ("calculix/incs", "time 0.4 of 1")])
+def test_a_run_that_ended_early_is_left_out_and_told(tmp_path: Path, failed: str, why: str) -> None:
+    place = model(tmp_path / "mine", Load1=failed, Load2="febio/hex8")
+    files, notes = model_files(LOADS, [place], ModelReading())
+    assert list(files) == ["Load2"]
+    (note,) = notes
+    assert note.startswith("mine: the run of Load1 ended")
+    assert why in note
+    assert "is not compared" in note
+    assert "--unfinished" in note
+    files, notes = model_files(LOADS, [place], ModelReading(unfinished=True))
+    assert list(files) == list(LOADS)
+    assert why in notes[0]
+    assert "not compared" not in notes[0]
+
+
+def test_where_no_run_ended_nothing_is_compared(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="ERROR TERMINATION"):
+        model_files(LOADS, [model(tmp_path / "mine", Load1="febio/fails")], ModelReading())

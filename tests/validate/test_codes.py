@@ -1,0 +1,106 @@
+"""Results that FEBio 4 and CalculiX 2.20 wrote, of our own models of a few elements, beside the displacements as text.
+
+``codes.zip`` holds results, models, logs and the displacements that each code printed; the last state counts.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc import read_mesh
+from dvc.errors import MrstrainError
+from validate import read_result
+from validate.run_end import early_end
+
+CODES = Path(__file__).with_name("codes.zip")
+with zipfile.ZipFile(CODES) as packed:
+    RESULTS = sorted(name for name in packed.namelist() if name.endswith((".xplt", ".frd")))
+
+REFUSED = {
+    "febio/cut.xplt": "the last section is incomplete",
+    "febio/cut2.xplt": "the last section is incomplete",
+    "febio/cut3.xplt": "the last section is incomplete",
+    "febio/cutmesh.xplt": "the last section is incomplete",
+    "febio/text.xplt": "not a FEBio plot file",
+    "febio/must.xplt": "FEBio wrote no loaded state",
+    "febio/nodisp.xplt": '<var type="displacement"/>',
+    "calculix/binary.frd": r"\*NODE FILE",
+    "calculix/far.frd": "100 m across",
+    "calculix/modes.frd": "the displacement is 0 everywhere",
+    "calculix/noU.frd": r"\*NODE FILE, U",
+    "calculix/nset.frd": "4 of 8 nodes have no displacement",
+}
+EARLY = {
+    "febio/fails.xplt": "ended with ERROR TERMINATION at time 0.3 of 1 (fails.log)",
+    "calculix/fails.frd": "ended at time 0.7 of 1 (fails.inp)",
+    "calculix/incs.frd": "ended at time 0.4 of 1 (incs.inp)",
+}
+# Elements of which the file has more nodes than are taken, or shells and beams that CalculiX has expanded to solids,
+# whose nodes are new: the others are compared.
+FEWER = {"febio/hex27.xplt", "febio/tet15.xplt", *(f"calculix/{name}.frd" for name in ("shell", "shell8", "beam"))}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("codes")
+    with zipfile.ZipFile(CODES) as packed:
+        packed.extractall(place)
+    return place
+
+
+def printed(result: Path) -> dict[int, list[float]]:
+    """Displacement (mm) by the number of the node, as the code itself printed it for the last state."""
+    if result.suffix == ".xplt":
+        last = result.with_name(f"{result.stem}_U.txt").read_text().split("*Step")[-1]
+    else:
+        text = result.with_suffix(".dat").read_text()
+        last = text[text.rindex(" displacements (vx,vy,vz)") :].replace("\n\n", "\n", 1).split("\n\n")[0]
+    rows = [line.split() for line in last.splitlines() if line.strip()[:1].isdigit()]
+    return {int(number): [float(value) for value in values] for number, *values in rows}
+
+
+@pytest.mark.parametrize("name", [name for name in RESULTS if name not in REFUSED])
+def test_displacements_are_those_that_the_code_printed(folder: Path, name: str) -> None:
+    found, truth = read_mesh(folder / name), printed(folder / name)
+    u = np.asarray(found.at_nodes["displacement"])
+    numbers = np.arange(len(u)) + 1 if name.endswith(".xplt") else found.node_ids  # FEBio prints nodes in their order
+    at = [(place, int(number)) for place, number in enumerate(numbers) if int(number) in truth]
+    known = [(place, number) for place, number in at if np.isfinite(u[place]).all()]
+    assert len(known) == len(found.node_ids) or name in FEWER
+    theirs = np.array([truth[number] for _, number in known])
+    assert np.abs(theirs).max() > 0.1
+    np.testing.assert_allclose(u[[place for place, _ in known]], theirs, rtol=2e-6, atol=2e-6)
+    result = read_result("model", folder / name)
+    assert np.abs(result.deformation.u_mm).max() == pytest.approx(np.linalg.norm(theirs, axis=1).max(), rel=0.75)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_result_is_refused_with_its_cause(folder: Path, name: str) -> None:
+    with pytest.raises(MrstrainError, match=REFUSED[name]) as refused:
+        read_result("model", folder / name)
+    assert Path(name).name in str(refused.value)
+
+
+@pytest.mark.parametrize("name", [name for name in RESULTS if name not in REFUSED])
+def test_runs_that_ended_early_are_known_by_log_or_deck(folder: Path, name: str) -> None:
+    end = early_end(folder / name)
+    assert (end.reason if end else None) == EARLY.get(name)
+
+
+def test_without_log_and_deck_a_time_that_is_not_whole_is_doubted(folder: Path, tmp_path: Path) -> None:
+    for name in ("febio/fails.xplt", "calculix/incs.frd", "febio/tet4.xplt", "calculix/c3d4.frd"):
+        alone = tmp_path / Path(name).name
+        alone.write_bytes((folder / name).read_bytes())
+        end = early_end(alone)
+        assert (end is not None) == (name in EARLY)
+        assert end is None or not end.certain
+    cut = tmp_path / "tet4.xplt"
+    cut.with_suffix(".log").write_text("===== beginning time step 5 : 1 =====\n")
+    end = early_end(cut)
+    assert end is not None
+    assert end.certain
+    assert "no end in its log" in end.reason

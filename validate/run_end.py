@@ -1,0 +1,87 @@
+"""Whether the run that wrote a result reached its end, by its log or deck beside it, or by its time."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+from dvc.io.meshes.calculix import time_reached as time_in_frd
+from dvc.io.meshes.febio import time_reached as time_in_xplt
+
+_NEARLY = 1.0 - 1e-3  # of the time of a run
+
+
+class EarlyEnd(NamedTuple):
+    """Why a result may not be that of the whole load."""
+
+    reason: str  # a clause whose subject is the run
+    certain: bool  # from its log or deck; otherwise only its time is unusual
+
+
+def early_end(place: Path) -> EarlyEnd | None:
+    """Why the run that wrote a result (.xplt, .frd) may have ended early; None where nothing says so.
+
+    FEBio says in its log how a run ended. Without a log, and for CalculiX, the time of the last state is compared with
+    the time of all steps in the deck. These files lie beside the result and have its name. ImageFileError for a damaged
+    result.
+    """
+    kind = place.suffix.lower()
+    if kind == ".xplt":
+        log = _text(place.with_suffix(".log"))
+        if "N O R M A L   T E R M I N A T I O N" in log:
+            return None
+        time, whole = time_in_xplt(place), _febio_time(place.with_suffix(".feb"))
+        at = f" at time {time:g}" + (f" of {whole:g}" if whole else "")
+        if "E R R O R   T E R M I N A T I O N" in log:
+            return EarlyEnd(f"ended with ERROR TERMINATION{at} ({place.stem}.log)", certain=True)
+        if log:
+            return EarlyEnd(f"has no end in its log ({place.stem}.log); its last state is that{at}", certain=True)
+        return _compared(time, whole, f"{place.stem}.feb")
+    if kind == ".frd":
+        return _compared(time_in_frd(place), _calculix_time(place.with_suffix(".inp")), f"{place.stem}.inp")
+    return None
+
+
+def _compared(time: float | None, whole: float | None, deck: str) -> EarlyEnd | None:
+    if time is None:
+        return None
+    if whole is not None:
+        ended = time >= _NEARLY * whole
+        return None if ended else EarlyEnd(f"ended at time {time:g} of {whole:g} ({deck})", certain=True)
+    if abs(time - round(time)) > 1.0 - _NEARLY:
+        return EarlyEnd(f"ended at time {time:g}, which may be before the end of its load", certain=False)
+    return None
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+def _febio_time(deck: Path) -> float | None:
+    """The time of all steps of an FEBio deck; None where it cannot be told."""
+    try:
+        root = ElementTree.fromstring(_text(deck))
+        controls = root.findall("./Step//Control") or root.findall("./Control")
+        times = [float(one.findtext("time_steps") or "") * float(one.findtext("step_size") or "") for one in controls]
+    except (ElementTree.ParseError, ValueError):
+        return None
+    return sum(times) or None
+
+
+def _calculix_time(deck: Path) -> float | None:
+    """The time of all steps of a CalculiX deck, which are 1 long unless they say otherwise; None where it has none."""
+    lines = [line.strip() for line in _text(deck).splitlines() if line.strip() and not line.startswith("**")]
+    times = []
+    for number, line in enumerate(lines):
+        if not re.match(r"\*(STATIC|VISCO|DYNAMIC|COUPLED TEMPERATURE-DISPLACEMENT)\b", line, re.IGNORECASE):
+            continue
+        following = lines[number + 1] if number + 1 < len(lines) else "*"
+        numbers = [] if following.startswith("*") else following.split(",")
+        try:
+            times.append(float(numbers[1]) if len(numbers) > 1 and numbers[1].strip() else 1.0)
+        except ValueError:
+            return None
+    return sum(times) or None
