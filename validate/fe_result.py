@@ -19,6 +19,7 @@ from dvc.deformation.nodal import OnMesh
 from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
+from validate.rigid_parts import without_rigid_parts
 from validate.tetrahedra import linear_tetrahedra
 
 _NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")
@@ -45,11 +46,14 @@ class FeResult:
         Name of the model in tables; and its file, for messages.
     deformation : OnMesh
         Displacement (n, 3) of the mesh's nodes relative to the bone, LPS mm, in the frame of the unloaded image.
+    rigid_parts : tuple of str
+        Regions of the file that only moved and turned, such as a rigid plate. They are not part of the mesh.
     """
 
     name: str
     path: Path
     deformation: OnMesh
+    rigid_parts: tuple[str, ...] = ()
 
     @classmethod
     @checked
@@ -123,7 +127,8 @@ def read_result(
     names = _names_of_regions(place)
     regions = {names.get(region, region): cells for region, cells in tets.regions.items()}
     tets = TetMesh(rigid.apply(tets.points_mm), tets.cells, regions, tets.facets, tets.node_ids)
-    return FeResult(name, place, OnMesh(tets, moved))
+    tets, moved, rigid_parts = without_rigid_parts(tets, moved)
+    return FeResult(name, place, OnMesh(tets, moved), rigid_parts)
 
 
 def _names_of_regions(place: Path) -> dict[str, str]:

@@ -51,6 +51,9 @@ def _odd_models(case: LoadCase, labels: LabelMap, bones: Sequence[str]) -> list[
     warnings = []
     for result in case.fields()[1]:
         check_overlap(result.path, result.mesh, labels.grid)
+        if result.rigid_parts:
+            parts = ", ".join(result.rigid_parts)
+            warnings.append(f"{case.load}: {result.name} has rigid parts, which are not compared: {parts}.")
         warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
     return warnings
 

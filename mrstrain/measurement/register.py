@@ -25,7 +25,7 @@ from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.options.model import Flag
-from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
+from mrstrain.records.inputs import case_names, output_folder, read_subject, refuse_small_disk, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 
@@ -96,7 +96,6 @@ def register(
         voxels = int(np.prod(subject.reference.grid.shape))
         needed = (_BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel) * voxels * len(cases)
         refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
-        make_output(target)
         settings = Settings(chosen, align, running.seed, threads)
         model = model or error_model_of(chosen.name)
         files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}}
@@ -106,8 +105,10 @@ def register(
         record = record_of(subject, files, settings, registration, more)
         plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
         run = _Run(target, plan, images, start, progress or (lambda *_: None))
-        run.all(at_once, registration.chain, first)
-    return Series.of(target, run.finished(), run.failures, record)
+        with output_folder(target):
+            run.all(at_once, registration.chain, first)
+            finished = run.finished()
+    return Series.of(target, finished, run.failures, record)
 
 
 class InSeries(Running):

@@ -1,7 +1,8 @@
 """What a command was given, read and checked before anything is computed."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,20 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") ->
             f"{out}: {what} about {needed / 1e6:.0f} MB, but the disk has only {free / 1e6:.0f} MB left. Free disk "
             f"space, choose another folder (out){instead}."
         )
+
+
+@contextmanager
+def output_folder(out: Path) -> Iterator[None]:
+    """Make the output folder as `make_output` does; where an error ends the block, folders made and left empty go."""
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    make_output(out)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):  # not empty
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 def make_output(out: Path) -> None:

@@ -91,6 +91,18 @@ def test_runs_that_ended_early_are_known_by_log_or_deck(folder: Path, name: str)
     assert (end.reason if end else None) == EARLY.get(name)
 
 
+def test_a_rigid_part_is_no_tissue(folder: Path) -> None:
+    """FEBio's has a part of its own, by whose name it is told; the tissue is that of the model without the plate."""
+    found = read_result("model", folder / "febio/rigid.xplt")
+    assert len(found.rigid_parts) == 1
+    assert set(found.mesh.regions).isdisjoint(found.rigid_parts)
+    assert found.mesh.points_mm[:, 2].max() == pytest.approx(20.0)
+    alone = read_result("model", folder / "febio/hex8.xplt")
+    assert len(found.mesh.cells) == len(alone.mesh.cells)
+    assert not alone.rigid_parts
+    assert np.isfinite(found.deformation.u_mm).all()
+
+
 def test_without_log_and_deck_a_time_that_is_not_whole_is_doubted(folder: Path, tmp_path: Path) -> None:
     for name in ("febio/fails.xplt", "calculix/incs.frd", "febio/tet4.xplt", "calculix/c3d4.frd"):
         alone = tmp_path / Path(name).name

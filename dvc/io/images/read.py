@@ -17,6 +17,7 @@ from dvc.io.images.text_headers import read_meta_header, read_nrrd_header
 
 _log = logging.getLogger("dvc.images")
 
+_SMALLEST_MM, _LARGEST_MM = 1.0, 3000.0  # along the longest edge of an image
 _MIN_SLICES = 4
 
 _FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool], StoredVolume]]] = {
@@ -95,7 +96,19 @@ def read_voxels(
     stored = read_header(place, volume=volume, max_bytes=max_bytes)
     if stored.unit != "mm":
         _log.warning("%s: lengths converted from %s to mm", place, stored.unit)
+    _refuse_size_of_no_body(place, stored.grid, stored.unit)
     return stored.grid, stored.load()
+
+
+def _refuse_size_of_no_body(place: Path, grid: Grid, unit: str) -> None:
+    longest = float((grid.spacing_mm * grid.shape).max())
+    if not _SMALLEST_MM <= longest <= _LARGEST_MM:
+        size = f"{longest / 1000.0:.3g} m" if longest > _LARGEST_MM else f"{longest:.2g} mm"
+        likely = "mm" if unit != "mm" else "micrometres" if longest > _LARGEST_MM else "metres"
+        raise ImageFileError(
+            f"{place}: by its header, in {unit}, the image is {size} across, which no body part is. Its voxel sizes "
+            f"are probably in {likely}. Correct the header."
+        )
 
 
 def read_header(

@@ -110,6 +110,19 @@ def test_each_load_of_a_chain_starts_from_the_last_good_one(spy, scans, tmp_path
     assert begun_at["Load3"] is (spy.found["Load2"] if chain else None)
 
 
+def test_where_no_load_is_registered_no_folder_is_left(spy, scans, tmp_path):
+    given = {"bone": scans / "bone.nii.gz", "workers": 1}
+    with pytest.raises(RegistrationError, match="turned"):
+        register(scans / "Load0.nii.gz", [scans / "Turned.nii.gz"], out=tmp_path / "of" / "mine", **given)
+    assert list(tmp_path.iterdir()) == []
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    (kept / "notes.txt").write_text("mine")
+    with pytest.raises(RegistrationError, match="turned"):
+        register(scans / "Load0.nii.gz", [scans / "Turned.nii.gz"], out=kept, **given)
+    assert [path.name for path in kept.iterdir()] == ["notes.txt"]
+
+
 def test_the_bone_may_be_a_label_of_the_map(spy, scans, tmp_path, tiny_pair):
     given = {"labels": scans / "tissues.nrrd", "names": scans / "tissues.csv", "out": tmp_path / "out"}
     register(scans / "Load0.nii.gz", [scans / "Load1.nii.gz"], bone_label="bone", **given)

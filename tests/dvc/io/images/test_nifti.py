@@ -217,7 +217,7 @@ def test_a_header_that_claims_terabytes_is_refused_with_the_estimate(tmp_path: P
 
 def test_a_header_that_claims_gigabytes_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
     path = _save(tmp_path / "a.nii.gz", lambda header: header["dim"].__setitem__(slice(1, 4), [1500, 1500, 1500]))
-    with pytest.raises(ImageFileError, match="incomplete"):
+    with pytest.raises(ImageFileError, match=r"incomplete|3\.75 m across"):
         read_image(path)
 
 

@@ -107,13 +107,17 @@ def test_spacings_without_directions_are_refused(tmp_path: Path) -> None:
 def test_other_units_are_converted_and_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, unit: str, factor: float
 ) -> None:
+    x, y, z = (f"{number / factor:g}" for number in (1.5, 2.0, 1.0))
     for path in (
-        _nrrd(tmp_path / "a.nrrd", space_units=f'"{unit}" "{unit}" "{unit}"'),
-        _meta(tmp_path / "a.mha", DistanceUnits=unit),
-    ):
+        _nrrd(
+            tmp_path / "a.nrrd", space_units=f'"{unit}" "{unit}" "{unit}"',
+            space_directions=f"(0,{x},0) ({y},0,0) (0,0,-{z})",
+        ),
+        _meta(tmp_path / "a.mha", DistanceUnits=unit, ElementSpacing=f"{x} {y} {z}"),
+    ):  # fmt: skip
         caplog.clear()
         grid = read_image(path).grid
-        np.testing.assert_allclose(grid.spacing_mm, np.array([1.5, 2.0, 1.0]) * factor)
+        np.testing.assert_allclose(grid.spacing_mm, [1.5, 2.0, 1.0])
         np.testing.assert_allclose(grid.origin_mm, np.array([10, -20, 30]) * factor)
         assert f"converted from {unit} to mm" in caplog.text
 

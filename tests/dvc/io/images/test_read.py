@@ -265,3 +265,20 @@ def test_real_files_agree_with_simpleitk(
 def test_a_real_4d_file_is_refused_with_its_number_of_volumes(real_data: Path) -> None:
     with pytest.raises(ImageFileError, match=r"has 2 volumes, but one is needed.*volume=N.* with N from 0 to 1"):
         read_image(real_data / "brain-pair" / "example4d.nii.gz")
+
+
+@pytest.mark.parametrize(
+    ("edge", "says"), [(0.8, None), (0.0008, r"0\.0\d+ mm across.*in metres"), (800.0, r"\d m across.*in micrometres")]
+)
+@pytest.mark.parametrize("ending", [".nii.gz", ".nrrd", ".mha"])
+def test_a_size_that_no_body_part_has_is_refused_with_its_likely_unit(tmp_path, edge, says, ending):
+    sitk_image = sitk.GetImageFromArray(np.random.default_rng(1).normal(50.0, 1.0, (20, 21, 22)).astype(np.float32))
+    sitk_image.SetSpacing([edge] * 3)
+    path = tmp_path / f"image{ending}"
+    sitk.WriteImage(sitk_image, str(path))
+    if says is None:
+        assert read_image(path).grid.shape == (22, 21, 20)
+        return
+    with pytest.raises(ImageFileError, match=says) as refused:
+        read_image(path)
+    assert path.name in str(refused.value)
