@@ -19,6 +19,7 @@ from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 WHOLE = "all"
 """Name of the tissue in a set that has one constitutive model for all tissues."""
 
+_FAR = 10.0  # times the range of the published sets
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
@@ -48,7 +49,10 @@ class MaterialSet:
     materials: Materials
 
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
-        """The material of each region of a mesh, and a sentence for each region that gets that of another tissue.
+        """The material of each region of a mesh, and sentences on what a person should know of that choice.
+
+        That is each region that gets the material of another tissue, and each tissue that is over ten times as stiff,
+        or as soft, as in any published set: its parameters may be in another unit.
 
         Tendon and aponeurosis without a material get that of muscle, or else of fat; muscle gets that of fat. No other
         substitution is made.
@@ -64,9 +68,10 @@ class MaterialSet:
         >>> materials["muscle"] is materials["fat"], notes
         (True, ('friedman has no material for muscle; that of fat is used.',))
         """
-        by_region, notes = dict[str, Material](), []
+        by_region, notes = dict[str, Material](), list[str]()
         if WHOLE in self.materials:
-            return dict.fromkeys(regions, self.materials[WHOLE]), ()
+            by_region = dict.fromkeys(regions, self.materials[WHOLE])
+            return by_region, tuple(_odd_stiffness(self.name, by_region))
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
@@ -81,7 +86,30 @@ class MaterialSet:
             by_region[region] = known[name.casefold()]
             if name != region:
                 notes.append(f"{self.name} has no material for {region}; that of {name} is used.")
-        return by_region, tuple(notes)
+        return by_region, (*notes, *_odd_stiffness(self.name, by_region))
+
+
+def _odd_stiffness(name: str, materials: Materials) -> list[str]:
+    """A sentence for each tissue whose shear modulus no published set comes near, with the likely unit."""
+    found = []
+    for tissue, law in materials.items():
+        own, tried = law.shear_modulus_mpa, (tissue.casefold(), *_INSTEAD.get(tissue.casefold(), ()))
+        of_sets = [
+            [of[t] for t in (*tried, WHOLE) if t in of] for of in (one.materials for one in _published().values())
+        ]
+        known = [laws[0].shear_modulus_mpa for laws in of_sets if laws]
+        low, high = min(known), max(known)
+        is_named = any(set(tried) & set(one.materials) for one in _published().values())
+        if not is_named or low / _FAR <= own <= high * _FAR:
+            continue
+        far = f"over ten times as {'stiff' if own > high else 'soft'} as in any published set"
+        units = {1e-3: " Are its parameters in kPa, entered as MPa?", 1e3: " Are they in MPa, entered as kPa?"}
+        unit = next((asks for times, asks in units.items() if low / _FAR <= own * times <= high * _FAR), "")
+        found.append(
+            f"{name}: {tissue} has a shear modulus of {1e3 * own:.3g} kPa, which is {far} ({1e3 * low:.3g} to "
+            f"{1e3 * high:.3g} kPa).{unit}"
+        )
+    return found
 
 
 def published_names() -> list[str]:

@@ -23,7 +23,7 @@ from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
 
 LOADS = (
@@ -95,6 +95,8 @@ def simulate(
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
     plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}
     held = fe.fixed_facets(read, simulation.fixed)
+    for note in (note for one in chosen for note in one.for_regions(read.regions)[1]):
+        tell(NOTE, note, 0.0)
     jobs = [
         (one, problem)
         for one in chosen

@@ -12,6 +12,7 @@ from typing import Any
 from dvc import Verdict
 from dvc.report.page import Section
 from dvc.worker import Worker
+from mrstrain.records.progress import NOTE
 
 Tell = Callable[[str, float], None]
 _REGISTERING = {"aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2)}
@@ -73,6 +74,8 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
     begun: dict[str, float] = {}
 
     def told(case: str, stage: str, fraction: float) -> None:
+        if case == NOTE:  # is in the summary, too
+            return
         begun[case] = fraction
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))
 

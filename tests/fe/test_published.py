@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dvc.errors import InputError
-from fe import material_set, published_names, read_material_sets
+from fe import MaterialSet, NeoHooke, Ogden, material_set, published_names, read_material_sets
 
 # Initial shear modulus (kPa) and Poisson's ratio by hand from the printed numbers.
 PRINTED = {
@@ -28,6 +28,21 @@ PRINTED = {
     ("zwam", "fat"): (16.45 * 6.82 / 2, 0.49),
     ("zwam", "muscle"): (20.07, 0.49),
 }
+
+
+def test_a_stiffness_in_another_unit_is_told() -> None:
+    """Ten times the range of the published sets, of the tissue or of what stands for it."""
+    fat, skin = Ogden.of(0.0105, 6.2), NeoHooke.of(0.1)
+    usual = MaterialSet("mine", "", "", {"fat": fat, "skin": skin, "foam": NeoHooke.of(1e3)})
+    assert usual.for_regions(["fat", "skin", "foam"])[1] == ()
+    (note,) = MaterialSet("mine", "", "", {"fat": Ogden.of(10.5, 6.2)}).for_regions(["fat"])[1]
+    assert note.startswith("mine: fat has a shear modulus of 1.05e+04 kPa")
+    assert note.endswith("in kPa, entered as MPa?")
+    (note,) = MaterialSet("mine", "", "", {"all": NeoHooke.of(5e-6)}).for_regions(["skin"])[1]
+    assert "as soft as in any published set" in note
+    assert note.endswith("in MPa, entered as kPa?")
+    for name in published_names():
+        assert not [note for note in material_set(name).for_regions(["fat", "muscle", "skin"])[1] if "modulus" in note]
 
 
 def test_every_published_law_has_the_printed_modulus() -> None:
