@@ -6,8 +6,10 @@ import queue
 import time
 import traceback
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import psutil
 from distributed import Client, Future, LocalCluster, get_worker
 from filelock import FileLock
 
-from dvc.errors import InputError, MrstrainError
+from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.software import software_key
 from dvc.threads import usable_cores
 from mrstrain.records.progress import OnProgress
@@ -24,6 +26,7 @@ from mrstrain.studies import stages
 from mrstrain.studies.stages import StageResult
 
 _TELL_EVERY_S = 1.0
+_TRIED = "This was computed at the second attempt."
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _LOOK_EVERY_S, _LOST_S = 5.0, 120.0
 _SETTINGS = {
@@ -179,7 +182,7 @@ def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
 
 
 def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[StageResult | str, float]:
-    """Run a stage in a worker, under its lock; errors are returned as text."""
+    """Run a stage in a worker, under its lock, and once more if a process of it dies; errors are returned as text."""
     began, reported = time.monotonic(), -_TELL_EVERY_S
     worker = get_worker()
 
@@ -191,9 +194,18 @@ def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: 
             worker.log_event(topic, (name, what, float(fraction)))
 
     tell("begun", 0.0)
+    stage: Callable[[], StageResult] = partial(getattr(stages, function), tell, **arguments)
+    outcome: StageResult | str
     try:
         with FileLock(lock):
-            outcome: StageResult | str = getattr(stages, function)(tell, **arguments)
+            try:
+                outcome = stage()
+            except WorkerError as death:
+                tell("once more", 0.0)
+                again = stage()
+                outcome = replace(again, lines=(*again.lines, f"{_TRIED} {death}"))
+    except WorkerError as death:
+        outcome = f"{death} It was tried twice."
     except MrstrainError as error:
         outcome = str(error)
     except Exception:
