@@ -99,7 +99,7 @@ def _odd_stiffness(name: str, materials: Materials) -> list[str]:
         ]
         known = [laws[0].shear_modulus_mpa for laws in of_sets if laws]
         low, high = min(known), max(known)
-        is_named = any(set(tried) & set(one.materials) for one in _published().values())
+        is_named = any(tissue.casefold() in one.materials for one in _published().values())
         if not is_named or low / _FAR <= own <= high * _FAR:
             continue
         far = f"over ten times as {'stiff' if own > high else 'soft'} as in any published set"

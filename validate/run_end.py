@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 from dvc.io.meshes.calculix import time_reached as time_in_frd
 from dvc.io.meshes.febio import time_reached as time_in_xplt
 
+_BANNER = "F O R   B I O M E C H A N I C S"  # of every log of FEBio
 _NEARLY = 1.0 - 1e-3  # of the time of a run
 
 
@@ -34,7 +35,7 @@ def early_end(place: Path) -> EarlyEnd | None:
         at = f" at time {time:g}" + (f" of {whole:g}" if whole else "")
         if "E R R O R   T E R M I N A T I O N" in log:
             return EarlyEnd(f"ended with ERROR TERMINATION{at} ({place.stem}.log)", certain=True)
-        if log:
+        if _BANNER in log:
             return EarlyEnd(f"has no end in its log ({place.stem}.log); its last state is that{at}", certain=True)
         return _compared(time, whole, f"{place.stem}.feb")
     if kind == ".frd":
@@ -73,7 +74,9 @@ def _febio_time(deck: Path) -> float | None:
 
 def _calculix_time(deck: Path) -> float | None:
     """The time of all steps of a CalculiX deck, which are 1 long unless they say otherwise; None where it has none."""
-    lines = [line.strip() for line in _text(deck).splitlines() if line.strip() and not line.startswith("**")]
+    lines = [line for raw in _text(deck).splitlines() if (line := raw.strip()) and not line.startswith("**")]
+    if any(re.search(r"TIME RESET|TOTAL TIME AT START|PERTURBATION", line, re.IGNORECASE) for line in lines):
+        return None  # the total time is not the sum of the steps
     times = []
     for number, line in enumerate(lines):
         if not re.match(r"\*(STATIC|VISCO|DYNAMIC|COUPLED TEMPERATURE-DISPLACEMENT)\b", line, re.IGNORECASE):

@@ -177,6 +177,7 @@ def register(
         beside.submit(engine.prepare)
         noise = beside.submit(noise_of, reference, loaded, body)
         pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
+        of_noise = noise.result()  # which took less time than the alignment
         guess = start
         if isinstance(start, BSpline):  # and remains one
             guess = start.turned(turn.T)
@@ -186,7 +187,7 @@ def register(
         found = engine.find(pair, start=guess, seeds=_seeds(chosen)[1:], worker=runner, progress=tell)
     return Registration(
         reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,
-        time.monotonic() - began, noise.result(), found.choice, found.unlike_study,
+        time.monotonic() - began, of_noise, found.choice, found.unlike_study,
     )  # fmt: skip
 
 

@@ -51,9 +51,10 @@ def read_subject(
 def read_matrix(path: Path) -> FloatArray:
     """Read a 4 x 4 matrix from a text file of four rows; InputError for any other file."""
     try:
-        return matrix_of(np.loadtxt(path), str(path))
+        rows = np.loadtxt(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a matrix of four rows of four numbers ({error}).") from error
+    return matrix_of(rows, str(path))
 
 
 def matrix_of(rows: object, where: str) -> FloatArray:
@@ -67,7 +68,7 @@ def matrix_of(rows: object, where: str) -> FloatArray:
     if not np.isfinite(matrix).all():
         row, column = np.argwhere(~np.isfinite(matrix))[0] + 1
         raise InputError(f"{where}: the number in row {row}, column {column} of the matrix is not finite.")
-    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+    if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-9):
         raise InputError(f"{where}: the last row of the matrix must be 0 0 0 1; it is {matrix[3].tolist()}.")
     return matrix
 

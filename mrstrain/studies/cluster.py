@@ -143,10 +143,13 @@ def _kill_workers(local: LocalCluster) -> None:
     """End the processes of a cluster and what they have started; Dask would wait for stages that do not listen."""
     for nanny in local.workers.values():
         nanny.auto_restart = False
-        with suppress(psutil.NoSuchProcess):
+        if nanny.pid is None:  # about to be restarted; psutil would take it for this process
+            continue
+        with suppress(psutil.Error):
             worker = psutil.Process(nanny.pid)
-            for process in (*worker.children(recursive=True), worker):
-                process.kill()
+            for process in (worker, *worker.children(recursive=True)):  # the worker first: it would try a stage again
+                with suppress(psutil.Error):
+                    process.kill()
 
 
 def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:

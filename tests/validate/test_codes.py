@@ -111,7 +111,7 @@ def test_without_log_and_deck_a_time_that_is_not_whole_is_doubted(folder: Path, 
         assert (end is not None) == (name in EARLY)
         assert end is None or not end.certain
     cut = tmp_path / "tet4.xplt"
-    cut.with_suffix(".log").write_text("===== beginning time step 5 : 1 =====\n")
+    cut.with_suffix(".log").write_text("F O R   B I O M E C H A N I C S\n===== beginning time step 5 : 1 =====\n")
     end = early_end(cut)
     assert end is not None
     assert end.certain
