@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import queue
+import signal
 import time
 import traceback
 import uuid
@@ -111,6 +112,7 @@ def cluster(
                 ) as local,
                 Client(local) as client,
             ):  # fmt: skip
+                client.run(_ignore_interrupts)
                 try:
                     yield StageRunner(client, watch)
                 except BaseException:
@@ -137,6 +139,11 @@ def cluster(
                 yield runner
             finally:
                 client.cancel(list(runner._under_way))
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C, which a terminal sends to every process, to the one that a person has started."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _kill_workers(local: LocalCluster) -> None:

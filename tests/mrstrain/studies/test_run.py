@@ -27,6 +27,7 @@ from mrstrain.studies.cluster import cluster
 from mrstrain.studies.cohort import cohort
 from mrstrain.studies.file import read_study
 from mrstrain.studies.init import init
+from mrstrain.studies.ledger import StageRecord
 from mrstrain.studies.plan import plan
 from mrstrain.studies.run import forecast, report, run, run_studies
 from tests.processes import cluster_of_two, under_way, wait_for
@@ -397,7 +398,8 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
     assert "Ada" in page
     assert "Ben" in page
     ledger = places[1] / "results" / ".study" / "register Load1.json"
-    ledger.write_text(re.sub(r'"level":"(trust|caution)"', '"level":"distrust"', ledger.read_text()))
+    doubted = re.sub(r'"level":"(trust|caution)"', '"level":"distrust"', ledger.read_text())
+    ledger.write_text(StageRecord.model_validate_json(doubted).sealed().model_dump_json())
     doubtful = [note for note in cohort(places, out=tmp_path / "cohort").notes if "Do not trust" in note]
     assert [note.split(",")[0] for note in doubtful] == [
         "Ben: the verdict on the registration of Load1 is Do not trust"
