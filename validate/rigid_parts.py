@@ -19,12 +19,10 @@ def without_rigid_parts(mesh: TetMesh, u_mm: FloatArray) -> tuple[TetMesh, Float
     1e-5 of the largest displacement. If all regions are rigid, or nothing is strained by more than 1e-3 (Green-Lagrange
     strain), nothing is left out.
     """
-    F = np.eye(3) + OnMesh(mesh, u_mm).cell_gradients
-    strain = np.abs(0.5 * (np.swapaxes(F, 1, 2) @ F - np.eye(3))).max(axis=(1, 2))
     rounded = _ROUNDED * float(np.linalg.norm(u_mm, axis=1).max())
     nodes = {name: np.unique(mesh.cells[cells]) for name, cells in mesh.regions.items()}
     rigid = tuple(name for name, at in nodes.items() if _moves_as_one(mesh.points_mm[at], u_mm[at], rounded))
-    if not rigid or strain.max() < _STRAINED:
+    if not rigid or not _strained(mesh, u_mm):
         return mesh, u_mm, ()
     kept = np.ones(len(mesh.cells), dtype=bool)
     kept[np.concatenate([mesh.regions[name] for name in rigid])] = False
@@ -41,6 +39,11 @@ def without_rigid_parts(mesh: TetMesh, u_mm: FloatArray) -> tuple[TetMesh, Float
         u_mm[used],
         rigid,
     )
+
+
+def _strained(mesh: TetMesh, u_mm: FloatArray) -> bool:
+    F = np.eye(3) + OnMesh(mesh, u_mm).cell_gradients
+    return bool(np.abs(0.5 * (np.swapaxes(F, 1, 2) @ F - np.eye(3))).max() >= _STRAINED)
 
 
 def _moves_as_one(X: FloatArray, u_mm: FloatArray, rounded_mm: float) -> bool:

@@ -32,11 +32,11 @@ def early_end(place: Path) -> EarlyEnd | None:
         if "N O R M A L   T E R M I N A T I O N" in log:
             return None
         time, whole = time_in_xplt(place), _febio_time(place.with_suffix(".feb"))
-        at = f" at time {time:g}" + (f" of {whole:g}" if whole else "")
+        at = "" if time is None else f" at time {time:g}" + (f" of {whole:g}" if whole else "")
         if "E R R O R   T E R M I N A T I O N" in log:
             return EarlyEnd(f"ended with ERROR TERMINATION{at} ({place.stem}.log)", certain=True)
         if _BANNER in log:
-            return EarlyEnd(f"has no end in its log ({place.stem}.log); its last state is that{at}", certain=True)
+            return EarlyEnd(f"has no end in its log ({place.stem}.log) and stopped{at}", certain=True)
         return _compared(time, whole, f"{place.stem}.feb")
     if kind == ".frd":
         return _compared(time_in_frd(place), _calculix_time(place.with_suffix(".inp")), f"{place.stem}.inp")

@@ -177,7 +177,7 @@ def register(
         beside.submit(engine.prepare)
         noise = beside.submit(noise_of, reference, loaded, body)
         pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
-        of_noise = noise.result()  # which took less time than the alignment
+        of_noise = noise.result()  # known before the alignment, as a rule
         guess = start
         if isinstance(start, BSpline):  # and remains one
             guess = start.turned(turn.T)

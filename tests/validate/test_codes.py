@@ -5,15 +5,19 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from dvc import read_mesh
+from dvc import TetMesh, read_mesh
 from dvc.errors import MrstrainError
+from tests.blocks import block
 from validate import read_result
+from validate.rigid_parts import without_rigid_parts
 from validate.run_end import early_end
 
 CODES = Path(__file__).with_name("codes.zip")
@@ -101,6 +105,58 @@ def test_a_rigid_part_is_no_tissue(folder: Path) -> None:
     assert len(found.mesh.cells) == len(alone.mesh.cells)
     assert not alone.rigid_parts
     assert np.isfinite(found.deformation.u_mm).all()
+
+
+@pytest.mark.parametrize("digits", [None, 6])
+def test_rigid_parts_are_those_that_moved(digits: int | None) -> None:
+    """A plate that turned is one, also where displacements have six digits; tissue that is not loaded is none."""
+    boxes = [block((3, 3, 3), (9.0, 9.0, 9.0)) for _ in range(3)]
+    points = np.concatenate([box.points_mm + np.array([0.0, 0.0, 20.0 * n]) for n, box in enumerate(boxes)])
+    nodes, cells = len(boxes[0].points_mm), len(boxes[0].cells)
+    mesh = TetMesh(
+        points, np.concatenate([box.cells + nodes * n for n, box in enumerate(boxes)]),
+        {name: np.arange(cells) + cells * n for n, name in enumerate(("fat", "far", "plate"))},
+    )  # fmt: skip
+    u = np.zeros_like(points)
+    u[:nodes] = 0.1 * points[:nodes]
+    u[nodes : 2 * nodes] = 1e-7 * points[nodes : 2 * nodes]
+    turn = Rotation.from_euler("y", 5.0, degrees=True)
+    u[2 * nodes :] = turn.apply(points[2 * nodes :]) - points[2 * nodes :] + [0.0, 0.0, 7.0]
+    if digits:
+        u = np.vectorize(lambda value: float(f"{value:.{digits - 1}e}"))(u)
+    kept, moved, names = without_rigid_parts(mesh, u)
+    assert names == ("plate",)
+    assert set(kept.regions) == {"fat", "far"}
+    np.testing.assert_array_equal(moved, u[: 2 * nodes])
+    np.testing.assert_array_equal(kept.points_mm, points[: 2 * nodes])
+    assert without_rigid_parts(mesh, np.full_like(points, 3.0))[2] == ()  # all of it moves as one: not loaded
+
+
+@pytest.mark.parametrize(
+    ("steps", "early"),
+    [
+        ("*STATIC\n0.1, 1.\n", True),
+        ("*STATIC\n0.1, 0.4\n", False),
+        ("*STATIC, DIRECT\n ** a remark\n0.1, 0.2\n*STATIC\n0.1, 0.2\n", False),
+        ("*STATIC\n0.1, 0.3\n*STATIC, TIME RESET\n0.1, 0.4\n", None),  # the deck does not tell the time
+    ],
+)
+def test_the_time_of_a_deck(folder: Path, tmp_path: Path, steps: str, early: bool | None) -> None:
+    (tmp_path / "Load1.frd").write_bytes((folder / "calculix/incs.frd").read_bytes())  # to time 0.4
+    (tmp_path / "Load1.inp").write_text(f"*STEP\n{steps}*END STEP\n")
+    end = early_end(tmp_path / "Load1.frd")
+    assert (end is not None) == (early is not False)
+    assert end is None or end.certain == bool(early)
+
+
+def test_a_run_that_failed_before_its_first_state_has_no_time(folder: Path, tmp_path: Path) -> None:
+    whole = (folder / "febio/tet4.xplt").read_bytes()
+    at = 4
+    while (head := struct.unpack_from("<II", whole, at))[0] != 0x02000000:  # a state
+        at += 8 + head[1]
+    (tmp_path / "Load1.xplt").write_bytes(whole[:at])
+    (tmp_path / "Load1.log").write_text("E R R O R   T E R M I N A T I O N")
+    assert early_end(tmp_path / "Load1.xplt") == ("ended with ERROR TERMINATION (Load1.log)", True)
 
 
 def test_without_log_and_deck_a_time_that_is_not_whole_is_doubted(folder: Path, tmp_path: Path) -> None:
