@@ -89,3 +89,12 @@ def done(images, made_once, tmp_path_factory):
     own = tmp_path_factory.mktemp("done") / "study"
     shutil.copytree(folder / "study", own)
     return own, *json.loads((folder / "told.json").read_text())
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A study of text files, for stages that only write a file."""
+    (tmp_path / "results").mkdir()
+    for name in ("a", "b", "labels"):
+        (tmp_path / f"{name}.txt").write_text(name)
+    return tmp_path

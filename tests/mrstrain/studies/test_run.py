@@ -24,10 +24,8 @@ from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image
 from mrstrain.studies.check import check
 from mrstrain.studies.cluster import cluster
-from mrstrain.studies.cohort import cohort
 from mrstrain.studies.file import read_study
 from mrstrain.studies.init import init
-from mrstrain.studies.ledger import StageRecord
 from mrstrain.studies.plan import plan
 from mrstrain.studies.run import forecast, report, run, run_studies
 from tests.processes import cluster_of_two, under_way, wait_for
@@ -373,36 +371,3 @@ def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
     assert told.models.results == ("ansys",)
     assert len(told.models.sets) == 6
     assert "friedman" not in told.models.sets
-
-
-def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path):
-    folder, *_ = done
-    places = []
-    for name in ("Ada", "Ben"):
-        places.append(tmp_path / name)
-        shutil.copytree(folder, places[-1])
-        change(places[-1], ("Heel <b>3</b>", name))
-    told = cohort(places, out=tmp_path / "cohort")
-    assert all(o.reused for one in told.ran for o in one.outcomes.values())
-    (first,) = told.ranking
-    assert (first.model, first.subjects, first.nearest_in) == ("akrami", 2, 2)
-    with (folder / "results" / "comparison" / "areas.csv").open() as file:
-        shares = [float(r["share"]) for r in csv.DictReader(file) if r["load"] == "all loads"]
-    assert first.mean == pytest.approx(shares[0], rel=1e-5)
-    assert first.high - first.low == pytest.approx(0.0, abs=1e-12)  # one subject twice
-    with (tmp_path / "cohort" / "cohort.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {r["subject"] for r in rows} == {"Ada", "Ben"}
-    assert not any("Do not trust" in note for note in told.notes)
-    page = (tmp_path / "cohort" / "report.html").read_text()
-    assert "Ada" in page
-    assert "Ben" in page
-    ledger = places[1] / "results" / ".study" / "register Load1.json"
-    doubted = re.sub(r'"level":"(trust|caution)"', '"level":"distrust"', ledger.read_text())
-    ledger.write_text(StageRecord.model_validate_json(doubted).sealed().model_dump_json())
-    doubtful = [note for note in cohort(places, out=tmp_path / "cohort").notes if "Do not trust" in note]
-    assert [note.split(",")[0] for note in doubtful] == [
-        "Ben: the verdict on the registration of Load1 is Do not trust"
-    ]
-    with pytest.raises(InputError, match="different names"):
-        cohort([places[0], places[0]], out=tmp_path / "cohort")
