@@ -5,12 +5,13 @@ platforms do not allow from several threads of Python at once.
 """
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from queue import Empty, SimpleQueue
+import threading
+from collections.abc import Callable, Iterator
+from queue import SimpleQueue
 
 _PARTS = 4  # for each thread: what one part takes longer, another makes up for
+SMALL = 1 << 18
+"""Numbers that one thread adds up before another is awake: a loop over fewer is not shared."""
 
 
 def usable_cores() -> int:
@@ -18,13 +19,69 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class _Loop:
+    """Parts of a range, of which each thread takes the next until none is left."""
+
+    def __init__(self, kernel: Callable[..., None], ends: list[int], arguments: tuple[object, ...]) -> None:
+        self._kernel, self._ends, self._arguments = kernel, ends, arguments
+        self._parts: Iterator[int] = iter(range(len(ends) - 1))  # whose next() no two threads get
+        self._helping: list[threading.Thread] = []
+        self._ended = SimpleQueue[BaseException | None]()
+
+    def take(self) -> None:
+        for part in self._parts:
+            self._kernel(self._ends[part], self._ends[part + 1], *self._arguments)
+
+    def help(self) -> None:
+        """Take parts on another thread; what has begun after the last part was taken does nothing."""
+        self._helping.append(threading.current_thread())  # before the first part: the caller waits for it
+        failure = None
+        try:
+            self.take()
+        except BaseException as error:
+            failure = error
+        self._ended.put(failure)
+
+    def finish(self) -> None:
+        """Wait for the threads that took parts, once none is left; raises what one of them did."""
+        failures = list[BaseException]()
+        ended = 0
+        while ended < len(self._helping):  # counted anew each time: one that came too late may end first
+            failure = self._ended.get()
+            failures += [] if failure is None else [failure]
+            ended += 1
+        for failure in failures:
+            raise failure
+
+
 class _Threads:
     """The threads that this process computes on: NUMBA_NUM_THREADS, or as many as there are cores."""
 
     def __init__(self, count: int) -> None:
         self.count = count
-        # Beside the caller's own; starts them when there is work.
-        self.pool = ThreadPoolExecutor(max(1, count - 1), "compiled")
+        self._loops = SimpleQueue[_Loop | None]()
+        self._started = False
+        self._starting = threading.Lock()
+
+    def ask(self, loop: _Loop) -> None:
+        """Let the threads beside the caller's own take parts of a loop; the first that is asked for starts them."""
+        if not self._started:
+            with self._starting:
+                for _ in range(0 if self._started else self.count - 1):
+                    threading.Thread(target=self._serve, name="compiled", daemon=True).start()
+                self._started = True
+        for _ in range(self.count - 1):
+            self._loops.put(loop)
+
+    def _serve(self) -> None:
+        while (loop := self._loops.get()) is not None:
+            loop.help()
+            del loop  # and the arrays that it holds
+
+    def end(self) -> None:
+        """End the threads; loops that they are in are finished."""
+        for _ in range(self.count - 1 if self._started else 0):
+            self._loops.put(None)
 
 
 def _asked() -> int:
@@ -42,11 +99,17 @@ def count() -> int:
 
 def use(count: int) -> None:
     """Compute on so many threads from now on."""
+    _threads[-1].end()
     _threads[-1] = _Threads(count)
 
 
-if hasattr(os, "register_at_fork"):  # a forked process inherits the pool, but none of its threads
-    os.register_at_fork(after_in_child=lambda: use(count()))
+def _forked() -> None:
+    """A forked process has none of the threads of its parent."""
+    _threads[-1] = _Threads(count())
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
 
 
 def in_parts(kernel: Callable[..., None], size: int, *arguments: object) -> None:
@@ -61,21 +124,9 @@ def in_parts(kernel: Callable[..., None], size: int, *arguments: object) -> None
     if parts < 2:
         kernel(0, size, *arguments)
         return
-    ends = [size * part // parts for part in range(parts + 1)]
-    left = SimpleQueue[int]()
-    for part in range(parts):
-        left.put(part)
-
-    def take() -> None:
-        with suppress(Empty):
-            while True:
-                part = left.get_nowait()
-                kernel(ends[part], ends[part + 1], *arguments)
-
-    others = [threads.pool.submit(take) for _ in range(min(threads.count, parts) - 1)]
+    loop = _Loop(kernel, [size * part // parts for part in range(parts + 1)], arguments)
+    threads.ask(loop)
     try:
-        take()
+        loop.take()
     finally:
-        for other in others:
-            if not other.cancel():
-                other.result()
+        loop.finish()

@@ -4,6 +4,7 @@ import base64
 import gzip
 import io
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -19,6 +20,7 @@ from PIL import Image as Pixels
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.threads import usable_cores
 from dvc.trust.verdict import Level, Verdict
 
 Cell = str | float | int | None
@@ -188,7 +190,7 @@ def _packed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, mtime=0)).decode()
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _small(png: bytes) -> str:
     with Pixels.open(io.BytesIO(png)) as picture:
         file, pixels = io.BytesIO(), picture.convert("RGB")
@@ -228,6 +230,9 @@ def write_report(
     for viewer in (viewer for section in sections for viewer in section.viewers):
         for volume in (viewer.image, *viewer.overlays):
             volumes.setdefault(volume.data, f"volume-{len(volumes) + 1}")
+    pictures = [picture for section in (*sections, *closing) for picture in section.pictures]
+    with ThreadPoolExecutor(usable_cores()) as pool:  # which the template then finds done
+        list(pool.map(_small, (png for one in pictures for png in (one.png, *(png for _, png in one.beneath)))))
     scripts = {"page": _stored("page.js"), "viewer": _stored("viewer.js")}
     library = {"version": NIIVUE, "licence": _stored("niivue-LICENSE.txt"), "packed": _library()} if volumes else None
     page = _template("report").render(

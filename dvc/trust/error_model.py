@@ -8,6 +8,7 @@ that deviation. This holds for tissue that is strained and imaged like the study
 
 import json
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -357,10 +358,13 @@ def _figures_drawn(
     tissue = np.repeat(list(measured), np.diff(ends, prepend=0)).tolist()
     points, shear = np.stack(every, axis=1) * spacing_mm, max_shear[every].astype(np.float64)
     draws = TruthDraws(points, shear, tissue, to_bone_mm[every], table, seed, np.array(apart) * spacing_mm)
-    drawn = []
-    for _ in range(_DRAWS):
-        truths = np.split(draws.drawn(), ends[:-1])
-        drawn.append([figures_of(truth, volume) for truth, volume in zip(truths, volumes_ml, strict=True)])
+
+    def figures(truth: FloatArray) -> list[FloatArray]:
+        of_tissues = zip(np.split(truth, ends[:-1]), volumes_ml, strict=True)
+        return [figures_of(shear, volume) for shear, volume in of_tissues]
+
+    with ThreadPoolExecutor(1) as beside:  # figures of one truth while the next is drawn
+        drawn = list(beside.map(figures, (draws.drawn() for _ in range(_DRAWS))))
     return np.swapaxes(drawn, 0, 1)
 
 

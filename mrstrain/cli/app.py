@@ -1,6 +1,8 @@
 """The command line. It parses, calls one function, and prints; heavy imports wait until a command runs."""
 
+import atexit
 import ctypes
+import gc
 import logging
 import signal
 import sys
@@ -97,6 +99,7 @@ def main() -> None:
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     signal.signal(signal.SIGINT, _interrupted)
+    atexit.register(gc.freeze)  # half a second of collecting what ends with the process anyway
     try:
         app()
     except Exception as error:

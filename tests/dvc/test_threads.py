@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,49 @@ def test_every_number_of_a_range_is_done_once(count, size):
     finally:
         threads.use(before)
     np.testing.assert_array_equal(out, np.arange(size) ** 2)
+
+
+def test_a_thread_that_comes_too_late_is_not_taken_for_one_that_has_finished():
+    go_on, out = threading.Event(), np.zeros(1)
+
+    def slow(start: int, stop: int) -> None:
+        go_on.wait(5.0)
+        out[start:stop] = 1.0
+
+    loop = threads._Loop(slow, [0, 1], ())
+    helper, finishing = threading.Thread(target=loop.help), threading.Thread(target=loop.finish)
+    helper.start()
+    while not loop._helping:
+        time.sleep(0.001)
+    finishing.start()
+    time.sleep(0.05)
+    loop.help()  # finds no part left
+    finishing.join(0.2)
+    assert finishing.is_alive()
+    go_on.set()
+    finishing.join(5.0)
+    helper.join(5.0)
+    assert out[0] == 1.0
+
+
+def raises(start: int, stop: int, out: np.ndarray) -> None:
+    if start == 3:
+        raise ValueError("part 3")
+    out[start:stop] = 1
+
+
+def test_an_error_of_any_thread_is_raised_and_the_next_loop_runs():
+    before = threads.count()
+    threads.use(3)
+    try:
+        for _ in range(50):  # whichever thread takes the part
+            with pytest.raises(ValueError, match="part 3"):
+                threads.in_parts(raises, 12, np.zeros(12))
+        out = np.zeros(100, dtype=np.int64)
+        threads.in_parts(squares, 100, out)
+    finally:
+        threads.use(before)
+    np.testing.assert_array_equal(out, np.arange(100) ** 2)
 
 
 @pytest.mark.parametrize("told", ["", "-1", "4.0", "many", "2,1"])

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import Table
-from dvc.threads import in_parts
+from dvc.threads import SMALL, in_parts
 
 GRIDS = 3
 """Control grids that a solver looks at: the given one, and each next with points twice as far apart."""
@@ -48,8 +48,11 @@ def _along(axis: int, kernel: Callable[..., None], given: FloatArray, count: int
     """What a kernel makes of an array along one of its axes, which has so many places then."""
     before, here, after = given.shape[:axis], given.shape[axis], given.shape[axis + 1 :]
     out = np.empty((*before, count, *after))
-    lines = given.reshape(-1, here, int(np.prod(after)))
-    in_parts(kernel, len(lines), lines, out.reshape(len(lines), count, -1))
+    lines, found = given.reshape(-1, here, int(np.prod(after))), out.reshape(-1, count, int(np.prod(after)))
+    if out.size < SMALL:
+        kernel(0, len(lines), lines, found)
+    else:
+        in_parts(kernel, len(lines), lines, found)
     return out
 
 

@@ -8,7 +8,7 @@ from dvc.deformation.protocol import Deformation, RigidMotion, Within, displacem
 from dvc.deformation.strain_maps import strain_maps
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.registration.engine import AlignedPair
-from dvc.registration.gauss_newton.spline_sums import stored
+from dvc.registration.gauss_newton.sweeps import stored
 
 _SIZE = 16  # voxels of 1 mm along each edge
 _SHIFT_MM = 0.3

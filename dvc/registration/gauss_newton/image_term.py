@@ -17,7 +17,8 @@ from dvc.deformation.bspline import Table
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import cubic_at
 from dvc.images.resample import fill_missing
-from dvc.registration.gauss_newton.spline_sums import SplineSums, plane_sums
+from dvc.registration.gauss_newton.spline_sums import SplineSums
+from dvc.registration.gauss_newton.sweeps import plane_sums
 from dvc.threads import in_parts
 
 _GAIN_MM = 10.0
@@ -70,7 +71,9 @@ class ImagePair:
         self._step = np.array(self.grid.spacing_mm)
         axes = list(zip(control.indices_of(self.grid.origin_mm), self._step / control.spacing_mm, block, strict=True))
         along = [a + s * np.arange(n) for (a, s, _), n in zip(axes, self.grid.shape, strict=True)]
-        self.sums = SplineSums(control, along, self.inside, factors)
+        self.sums = SplineSums(control, along, self.inside)
+        # (ni, nj, nk, splines): what the splines are multiplied by at the voxels
+        self._factors = np.ones((0, 0, 0, 0)) if factors is None else np.ascontiguousarray(factors[..., 0])
         self._first: tuple[slice, ...] | None = None
         compared = self.share(inside) > 0  # a block is, if any voxel of it is: before `_first` is set
         if factors is None:
@@ -80,7 +83,7 @@ class ImagePair:
         else:
             self._first = tuple(slice(None, None, int(b)) for b in block)
             firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
-            self.blocks = SplineSums(control, firsts, compared, np.ascontiguousarray(factors[self._first]))
+            self.blocks = SplineSums(control, firsts, compared, factors[self._first])
         self._carried = np.zeros(self.grid.shape, dtype=np.float32)
 
     def share(self, where: BoolArray) -> FloatArray:
@@ -102,7 +105,7 @@ class ImagePair:
         shape = self.blocks.inside.shape
         both, own = np.zeros(shape), np.zeros(shape)
         in_parts(
-            _carry, len(both), coefficients, self.inside, self.sums.table, self.sums.factors, self._fixed,
+            _carry, len(both), coefficients, self.inside, self.sums.table, self._factors, self._fixed,
             self._scene, self._step, self.block, self._carried, both, own,
         )  # fmt: skip
         gain = _gain(both, own, _GAIN_MM / (self.block * self.grid.spacing_mm))
@@ -110,7 +113,7 @@ class ImagePair:
         half = np.zeros((self.grid.shape[0], coefficients.shape[0], 2, *self.sums.control.shape[1:]))
         in_parts(
             _normal, len(gain), self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block,
-            self.sums.table, self.sums.factors, matrix, sums, half,
+            self.sums.table, self._factors, matrix, sums, half,
         )  # fmt: skip
         square, count, other, others = sums.sum(axis=0)
         left_out = float(other / others) if others else np.nan
@@ -198,7 +201,7 @@ def _carry(
                     for m in range(3):
                         place = s[m]
                         for f in range(splines):
-                            a = 1.0 if alone else factors[i, j, k, f, 0]
+                            a = 1.0 if alone else factors[i, j, k, f]
                             for r in range(4):
                                 place += a * last[1][k, r] * row[3 * f + m, last[0][k] + r]
                         x += per_mm[0, m] * place
@@ -261,7 +264,7 @@ def _normal(
                     sums[bi, 0] += r * r
                     sums[bi, 1] += 1.0
                     for f in range(splines):
-                        share = r if alone else r * factors[i, j, k, f, 0]
+                        share = r if alone else r * factors[i, j, k, f]
                         for m in range(3):
                             for q in range(4):
                                 row[3 * f + m, last[0][k] + q] += last[1][k, q] * share * g[m]

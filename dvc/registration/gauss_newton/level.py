@@ -13,7 +13,8 @@ from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal
 from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, dot
-from dvc.registration.gauss_newton.spline_sums import SplineSums, Stiffness
+from dvc.registration.gauss_newton.spline_sums import SplineSums
+from dvc.registration.gauss_newton.sweeps import Stiffness
 from dvc.threads import in_parts
 
 _BLOCKS = 2.5  # blocks between two control points, about

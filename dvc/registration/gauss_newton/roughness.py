@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from dvc.arrays import FloatArray
 from dvc.images.image import Grid
 from dvc.registration.gauss_newton.coarser_grids import TWICE_AS_WIDE, coarser
-from dvc.threads import in_parts
+from dvc.threads import SMALL, in_parts
 
 _NEAR_MM = 4.0  # Gaussian over which the square of a Laplacian is averaged
 _LEAST = 0.05  # of its mean: where there is none, the weight still is finite
@@ -122,7 +122,10 @@ def _second_differences(count: int, spacing_mm: float) -> FloatArray:
 def _summed(coefficients: FloatArray, along: Sequence[FloatArray]) -> FloatArray:
     """The sum of three tridiagonal matrices, each applied along its own axis of (m, ni, nj, nk)."""
     out = np.empty_like(coefficients)
-    in_parts(_three_axes, out.shape[1], coefficients, along[0], along[1], along[2], out)
+    if out.size < SMALL:
+        _three_axes(0, out.shape[1], coefficients, along[0], along[1], along[2], out)
+    else:
+        in_parts(_three_axes, out.shape[1], coefficients, along[0], along[1], along[2], out)
     return out
 
 

@@ -55,7 +55,7 @@ def test_nothing_is_done_where_an_earlier_run_has_stored_its_loops(engine, monke
 
 
 def test_what_is_stored_is_seen(tmp_path) -> None:
-    told = "from dvc.registration.gauss_newton.spline_sums import stored; print(stored())"
+    told = "from dvc.registration.gauss_newton.sweeps import stored; print(stored())"
     there = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     seen = [sys.executable, "-c", told]
     assert subprocess.run(seen, env=there, capture_output=True, text=True, check=True).stdout == "False\n"
