@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dvc.errors import ImageFileError
-from dvc.io.meshes.raw import NumberedMesh, RawMesh, damage_named
+from dvc.io.meshes.raw import Members, NumberedMesh, RawMesh, damage_named, read_text
 
 _log = logging.getLogger("dvc.io.meshes.abaqus")
 
@@ -27,6 +27,7 @@ _SHAPES = {
 }  # fmt: skip
 _VARIANTS = set("HRIMTSPEW5")
 _READ = {"NODE", "ELEMENT", "ELSET", "NSET"}
+_CLOSED = {"PART", "INSTANCE", "ASSEMBLY", "STEP"}  # each has its END
 _ELSEWHERE = {"INCLUDE", "SYSTEM", "NGEN", "NCOPY", "NFILL", "ELGEN", "ELCOPY", "NMAP"}
 
 
@@ -46,9 +47,14 @@ def read_abaqus(path: Path) -> RawMesh:
     mesh = NumberedMesh(path)
     element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
     parts, in_assembly = 0, False
+    opened: dict[str, str] = {}
     for keyword in _keywords(path):
         where = f"{path}, *{keyword.name} in line {keyword.line}"
         parts += keyword.name == "PART"
+        if keyword.name in _CLOSED:
+            opened[keyword.name] = where
+        elif keyword.name.startswith("END "):
+            opened.pop(keyword.name.removeprefix("END "), None)
         _refuse_what_lies_elsewhere(where, keyword, parts)
         with damage_named(f"{where}: a row or an option"):
             if keyword.name in {"ASSEMBLY", "END INSTANCE"}:
@@ -56,6 +62,7 @@ def read_abaqus(path: Path) -> RawMesh:
             elif keyword.name in {"INSTANCE", "END ASSEMBLY"}:
                 in_assembly = False
             elif keyword.name == "NODE" and in_assembly:
+                mesh.left_out = True
                 _log.info("%s: %d reference points of the assembly are skipped.", where, len(keyword.rows))
             elif keyword.name == "NODE":
                 for row in keyword.rows:
@@ -68,17 +75,18 @@ def read_abaqus(path: Path) -> RawMesh:
                 chosen = element_sets if keyword.name == "ELSET" else node_sets
                 rows = [[x for x in row if x] for row in keyword.rows]
                 if "GENERATE" in keyword.options:  # first, last, and a step that may be left out
-                    rows = [[*map(str, range(int(a), int(b) + 1, *map(int, step[:1])))] for a, b, *step in rows]
-                chosen.extend(keyword, (x for row in rows for x in row))
+                    chosen.extend(keyword, (range(int(a), int(b) + 1, *map(int, step[:1])) for a, b, *step in rows))
+                else:
+                    chosen.extend(keyword, (x for row in rows for x in row))
+    if opened:
+        name, where = opened.popitem()
+        raise ImageFileError(f"{where} has no *END {name}: the file is incomplete. Export it again.")
     return mesh.by_index(element_sets.resolved(), node_sets.resolved())
 
 
 def _keywords(path: Path) -> Iterator[_Keyword]:
     """Yield the keywords with their options and data rows; comments left out, continued heads joined."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise ImageFileError(f"{path}: cannot be read ({error.strerror}).") from error
+    text = read_text(path)
     current: _Keyword | None = None
     head, head_line = "", 0
     for number, raw in enumerate(text.splitlines(), start=1):
@@ -132,6 +140,7 @@ def _add_elements(where: str, keyword: _Keyword, mesh: NumberedMesh) -> list[int
                 f"{', '.join(s for s in _SHAPES if s.startswith('C3D'))} and their variants (H, R, I, M ...)."
             )
         _log.warning("%s: elements of type %s carry no tissue and are skipped.", where, kind)
+        mesh.left_out = True
         return []
     shape, width = _SHAPES[max(stems, key=len)]
     # An element of many nodes goes over several lines, so rows are joined before they are cut.
@@ -152,17 +161,19 @@ class _Sets:
 
     def __init__(self, path: Path, kind: str) -> None:
         self._path, self._kind = path, kind
-        self._sets: dict[str, tuple[str, list[str]]] = {}  # names are the same in any case; the first spelling is kept
+        self._sets: dict[
+            str, tuple[str, list[str | range]]
+        ] = {}  # names are the same in any case; the first spelling is kept
 
-    def extend(self, keyword: _Keyword, more: Iterable[str]) -> None:
+    def extend(self, keyword: _Keyword, more: Iterable[str | range]) -> None:
         if self._kind not in keyword.options:
             raise ImageFileError(f"{self._path}, line {keyword.line}: *{self._kind} without a name ({self._kind}=...).")
         name = keyword.options[self._kind].strip('"')
         self._sets.setdefault(name.casefold(), (name, []))[1].extend(more)
 
-    def resolved(self) -> dict[str, list[int]]:
-        """Numbers of the members of each set."""
-        members = {}
+    def resolved(self) -> dict[str, Members]:
+        """Numbers of the members of each set, and ranges of numbers as the file generates them."""
+        members: dict[str, Members] = {}
         for name, _ in self._sets.values():
             try:
                 members[name] = self._members(name)
@@ -172,12 +183,15 @@ class _Sets:
                 _log.warning("%s The set is skipped.", error)  # nodes of an assembly: no tissue is lost with them
         return members
 
-    def _members(self, name: str, seen: tuple[str, ...] = ()) -> list[int]:
+    def _members(self, name: str, seen: tuple[str, ...] = ()) -> list[int | range]:
         key = name.strip('"').casefold()
         if key in seen or key not in self._sets:
             kind = {"ELSET": "element set", "NSET": "node set"}[self._kind]
             raise ImageFileError(f"{self._path}: the {kind} {name!r} is not defined, or contains itself.")
-        members: list[int] = []
+        members: list[int | range] = []
         for entry in self._sets[key][1]:
-            members += [int(entry)] if entry.isdigit() else self._members(entry, (*seen, key))
+            if isinstance(entry, range):
+                members.append(entry)
+            else:
+                members += [int(entry)] if entry.isdecimal() else self._members(entry, (*seen, key))
         return members

@@ -8,10 +8,11 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 from dvc.errors import ImageFileError
-from dvc.io.meshes.raw import NumberedMesh, RawMesh, damage_named
+from dvc.io.meshes.raw import Members, NumberedMesh, RawMesh, damage_named, read_text
 
 _log = logging.getLogger("dvc.io.meshes.ansys")
 
@@ -40,9 +41,9 @@ def read_ansys(path: Path) -> RawMesh:
     mesh = NumberedMesh(path)
     types: dict[str, str] = {}
     materials: dict[int, list[int]] = {}
-    components: dict[str, dict[str, list[int]]] = {"ELEM": {}, "NODE": {}}
+    components: dict[str, dict[str, Members]] = {"ELEM": {}, "NODE": {}}
     words: set[str] = set()
-    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
+    lines = iter(read_text(path).splitlines())
     for line in lines:
         fields = [f.strip() for f in line.split("!")[0].split(",")]
         word = fields[0].upper()
@@ -61,12 +62,15 @@ def read_ansys(path: Path) -> RawMesh:
                 _add_elements(lines, types, mesh, materials)
             elif word == "EBLOCK":
                 _log.warning("%s: a block of contact elements is skipped.", path)
+                mesh.left_out = True
             elif word == "CMBLOCK":
                 of_kind = components.setdefault(fields[2][:4].upper(), {})
                 of_kind[fields[1].upper()] = _members(lines, int(fields[3]))
     if not {"NBLOCK", "EBLOCK"} <= words:
         raise ImageFileError(f"{path}: no blocks of nodes or of elements. Write the file with CDWRITE, DB, name, cdb.")
-    regions = {f"material {number}": materials[number] for number in sorted(materials)}
+    if "FINISH" not in words:
+        _log.warning("%s does not end in FINISH, as CDWRITE writes it; its last components may be missing.", path)
+    regions: dict[str, Members] = {f"material {number}": materials[number] for number in sorted(materials)}
     return mesh.by_index(regions | components["ELEM"], components["NODE"])
 
 
@@ -112,6 +116,7 @@ def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMes
         cell = _shape(types[kind], nodes[:count])
         if cell is None:
             left_out[types[kind]] += 1
+            mesh.left_out = True
         else:
             mesh.add_element(number, *cell)
             of.setdefault(material, []).append(number)
@@ -119,14 +124,20 @@ def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMes
         _log.warning("%s: %d elements of type %s are skipped: not a supported solid or shell.", mesh.path, count, kind)
 
 
-def _members(lines: Iterator[str], count: int) -> list[int]:
+def _members(lines: Iterator[str], count: int) -> Members:
+    """Numbers of the items of a component, which has ``count`` numbers in the file."""
     _, width, *_ = _format(_next(lines, "CMBLOCK"))
     numbers: list[int] = []
     while len(numbers) < count:
         numbers += _columns(_next(lines, "CMBLOCK"), width)
-    members: list[int] = []
-    for number in numbers:  # a negative one ends a run
-        members += range(members[-1] + 1, -number + 1) if number < 0 else [number]
+    members: list[int | range] = []
+    for before, number in pairwise([0, *numbers]):
+        if number > 0:
+            members.append(number)
+        elif before > 0 > number:  # a negative one ends a run
+            members.append(range(before + 1, -number + 1))
+        else:
+            raise ValueError(f"{number} after {before} is neither an item nor the end of a run")
     return members
 
 

@@ -1,5 +1,6 @@
 """A mesh as its file gives it, before unit, frame and geometry are checked: what every reader returns."""
 
+import logging
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,10 +15,17 @@ from meshio._common import num_nodes_per_cell
 from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
 
+_log = logging.getLogger("dvc.io.meshes.raw")
+
 _DAMAGE = (
     ValueError, IndexError, KeyError, TypeError, AttributeError, ArithmeticError, OSError, StopIteration,
     struct.error, zlib.error,
 )  # fmt: skip
+
+_HIGHEST = np.iinfo(np.int64).max
+
+Members = Iterable[int | range]
+"""Numbers of the members of a set, and runs of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,14 +43,20 @@ class RawMesh:
 
 @dataclass(slots=True)
 class NumberedMesh:
-    """Nodes and elements as a text file lists them: by number, and elements by the numbers of their nodes."""
+    """Nodes and elements as a text file lists them: by number, and elements by the numbers of their nodes.
+
+    ``left_out`` says that some of them were passed over, so that a set may name what is not here.
+    """
 
     path: Path
     nodes: dict[int, list[float]] = field(default_factory=dict)
     elements: dict[int, tuple[str, list[int]]] = field(default_factory=dict)
+    left_out: bool = False
 
     def add_node(self, number: int, coordinates: list[float]) -> None:
-        """Add a node; refuse a number that is taken."""
+        """Add a node; refuse a number that is taken, or that no program gives."""
+        if not 0 < number <= _HIGHEST:
+            raise ImageFileError(f"{self.path}: {number} cannot be the number of a node. The file is damaged.")
         if number in self.nodes:
             raise ImageFileError(f"{self.path}: node {number} is defined twice.")
         self.nodes[number] = coordinates
@@ -57,10 +71,14 @@ class NumberedMesh:
         self.elements[number] = kind, nodes
 
     def by_index(
-        self, regions: Mapping[str, Iterable[int]], node_sets: Mapping[str, Iterable[int]] | None = None,
+        self, regions: Mapping[str, Members], node_sets: Mapping[str, Members] | None = None,
         at_nodes: Mapping[str, Mapping[int, list[float]]] | None = None,
     ) -> RawMesh:  # fmt: skip
-        """The mesh by indices, cells grouped by kind; sets may name what was left out, elements and fields may not."""
+        """The mesh by indices, cells grouped by kind.
+
+        Elements and fields must not name what the file does not define. Sets may; where nothing was left out, each
+        number of theirs that stands for nothing is logged as a warning. A range stands for what there is of it.
+        """
         if not self.nodes:
             raise ImageFileError(f"{self.path}: no mesh in this file (no nodes).")
 
@@ -87,14 +105,33 @@ class NumberedMesh:
             np.array(list(self.nodes.values()), dtype=np.float64),
             np.array(list(self.nodes), dtype=np.int64),
             [(kind, np.array(list(block.values()), dtype=np.int64)) for kind, block in blocks.items()],
-            {name: _known(members, cell_of) for name, members in regions.items()},
-            {name: _known(members, index_of) for name, members in (node_sets or {}).items()},
+            {name: self._known(f"the element set {name!r}", of, cell_of) for name, of in regions.items()},
+            {name: self._known(f"the node set {name!r}", of, index_of) for name, of in (node_sets or {}).items()},
             fields,
         )
 
+    def _known(self, name: str, members: Members, position: Mapping[int, int]) -> IntArray:
+        """Positions of the members of a set that are in the mesh."""
+        known, unknown = list[int](), list[int]()
+        for each in members:
+            if isinstance(each, int):
+                (known if each in position else unknown).append(each)
+            elif (each.stop - each.start) // each.step > len(position):  # of any length where the file is damaged
+                known += [number for number in position if number in each]
+            else:
+                known += [number for number in each if number in position]
+        if unknown and not self.left_out:
+            what = f"{name} names {len(unknown)} that the file does not define, such as {unknown[0]}"
+            _log.warning("%s: %s. The file may be incomplete or damaged.", self.path, what)
+        return np.unique(np.array([position[number] for number in known], dtype=np.int64))
 
-def _known(members: Iterable[int], position: Mapping[int, int]) -> IntArray:
-    return np.unique(np.array([position[number] for number in members if number in position], dtype=np.int64))
+
+def read_text(path: Path) -> str:
+    """The text of a mesh file; what is not UTF-8 stands as a mark that no number has."""
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ImageFileError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
 @contextmanager

@@ -198,6 +198,10 @@ def test_what_cannot_be_a_mesh_file_is_refused(tmp_path: Path) -> None:
         ("PART ONE", "PART TWO", "'PART TWO' is not defined"),
         ("PART ONE", "Skin", "'Skin' is not defined, or contains itself"),
         ("\n21, ", f"\n21, {TAGS[0] + 1}, {TAGS[1]}, 1, 1\n99, ", "which is not defined in the file"),
+        ("*HEADING", "*PART, NAME=a", r"\*PART in line 1 has no \*END PART: the file is incomplete"),
+        ("PART ONE", "\N{SUPERSCRIPT TWO}", "'\N{SUPERSCRIPT TWO}' is not defined"),
+        ("*Node\n", f"*Node\n{2**64}, 0, 0, 0\n", f"{2**64} cannot be the number of a node"),
+        ("21, 30, 1", "21, 30, 0", "a row or an option cannot be read"),
     ],
 )
 def test_what_is_not_read_in_an_abaqus_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -207,6 +211,45 @@ def test_what_is_not_read_in_an_abaqus_file_is_refused(tmp_path: Path, old: str,
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(ImageFileError, match=message):
         read_mesh(path)
+
+
+@pytest.mark.parametrize("last", [2**32, 2**63])
+def test_numbers_that_a_set_generates_are_bounded_by_those_of_the_file(tmp_path: Path, last: int) -> None:
+    path = written(tmp_path, "inp")
+    path.write_text(path.read_text().replace("21, 30, 1", f"21, {last}, 2"))
+    tets = read_mesh(path).tets
+    assert tets is not None
+    np.testing.assert_array_equal(tets.regions["part one"], np.arange(20, 48, 2))
+
+    path = written(tmp_path, "cdb")
+    path.write_text(path.read_text().replace(f"{21:10d}{-48:10d}", f"{21:10d}{-999999999:10d}"))
+    tets = read_mesh(path).tets
+    assert tets is not None
+    np.testing.assert_array_equal(tets.regions["SKIN"], np.arange(20, 48))
+
+
+def test_what_a_set_names_and_the_file_does_not_define_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = written(tmp_path, "inp")
+    path.write_text(path.read_text().replace("31, 32,", "31, 99,"))
+    assert read_mesh(path).cell_count == 50
+    assert "the element set 'skin' names 1 that the file does not define, such as 99" in caplog.text
+    caplog.clear()
+    path.write_text(path.read_text() + f"*ELEMENT, TYPE=SPRINGA\n99, {TAGS[0]}, {TAGS[1]}\n")
+    read_mesh(path)
+    assert "does not define" not in caplog.text
+
+
+def test_an_ansys_archive_that_may_be_cut_after_a_block_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = written(tmp_path, "cdb")
+    read_mesh(path)
+    assert "FINISH" not in caplog.text
+    path.write_text(path.read_text().partition("/GO")[0])
+    read_mesh(path)
+    assert "heel.cdb does not end in FINISH" in caplog.text
 
 
 def row(*numbers: int) -> str:
@@ -222,6 +265,7 @@ def row(*numbers: int) -> str:
         ("(8i10)", "(8i0)", r"a row of CMBLOCK cannot be read"),
         (row(4, 0, 1), row(3, 0, 1), r"element 1 has 3 nodes, but a tetra needs 4"),
         (row(4, 0, 2), row(4, 0, 1), r"element 1 is defined twice"),
+        (f"{1:10d}{-20:10d}", f"{-1:10d}{-20:10d}", r"a row of CMBLOCK cannot be read \(-1 after 0 is neither"),
         (f"{TAGS[1]:9d}{0:9d}{0:9d}", f"{TAGS[0]:9d}{0:9d}{0:9d}", f"node {TAGS[0]} is defined twice"),
     ],
 )
