@@ -157,7 +157,7 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
             raise ImageFileError(f"{path}: cells of kind {kind!r} are not supported, only {', '.join(_CORNERS)}.")
         index = checked_indices(f"{kind} cells", nodes, len(points), num_nodes_per_cell[kind])
         blocks.append(CellBlock(kind, frozen(index, np.int64)))
-    volumes = [block for block in blocks if block.shape in _VOLUMES]
+    volumes = [block for block in blocks if block.shape in _VOLUMES and len(block.nodes)]
     if not volumes:
         kinds = ", ".join(sorted({block.kind for block in blocks})) or "no cells at all"
         raise ImageFileError(f"{path}: no volume cells (found: {kinds}). Pass the volume mesh, not its surface.")

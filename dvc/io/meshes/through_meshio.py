@@ -16,8 +16,11 @@ from typing import Any
 
 import meshio
 import numpy as np
+import numpy.typing as npt
+from meshio._common import num_nodes_per_cell
 from meshio._mesh import topological_dimension
-from meshio.gmsh import _gmsh22, _gmsh41
+from meshio.gmsh import _gmsh22, main as gmsh
+from meshio.gmsh.common import _gmsh_to_meshio_type
 
 from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
@@ -31,7 +34,9 @@ topological_dimension.update({"wedge15": 3, "pyramid13": 3})
 # Cell arrays that hold a region's number, in the order in which they are looked for.
 _REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part", "part_id")
 _MOST_REGIONS = 256
-_GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"(.*)"[ \t]*\r?$', re.MULTILINE)
+_MOST_STEPS = 1_000_000  # a number alone on a line may be that of a time step, in a small file too
+_HIGHEST_NUMBER = 100_000_000  # meshio keeps an array of so many
+_GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"?(.*?)"?[ \t]*\r?$', re.MULTILINE)
 # Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
 _TO_VTK = {
     "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
@@ -45,8 +50,11 @@ def read_gmsh(path: Path) -> RawMesh:
     with suppress(ValueError):  # no section of names
         named = _GROUP.findall(_section(path.read_bytes(), b"PhysicalNames"))
         names = {(int(d), int(tag)): name.decode(errors="replace") for d, tag, name in named}
-    with _names_apart(path, names) as (place, real):
-        mesh = _read(path, lambda _: meshio.gmsh.read(str(place)))
+    tags = _node_numbers(path)
+    with _names_apart(path, names) as (place, real), _BoundedFile(place) as file:
+        mesh = _read(path, lambda _: gmsh.read_buffer(file))
+    if len(tags) != len(mesh.points):
+        raise ImageFileError(f"{path}: {len(tags)} node numbers for {len(mesh.points)} nodes; the file is damaged.")
     blocks = [(c.type, c.data[:, _TO_VTK[c.type]] if c.type in _TO_VTK else c.data) for c in mesh.cells]
     sizes = [len(data) for _, data in blocks]
     groups: list[tuple[str, IntArray]] = []
@@ -61,15 +69,37 @@ def read_gmsh(path: Path) -> RawMesh:
             if len(parts) != len(starts):
                 raise ImageFileError(f"{path}: the $Elements section is incomplete.")
             own = [np.asarray(part, dtype=np.int64) + start for part, start in zip(parts, starts, strict=True)]
-            groups.append((real[name], np.concatenate(own)))
+            groups.append((real.get(name, name), np.concatenate(own)))
     regions: dict[str, IntArray] = {}
     for name, cells in groups:  # a volume and its surface may share a name: the shape distinguishes their cells
         regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
-    return RawMesh(path, mesh.points, _node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
+    return RawMesh(path, mesh.points, tags, blocks, regions, at_nodes=mesh.point_data)
 
 
-def _node_numbers(path: Path, count: int) -> IntArray:
-    """Node tags (count,) of a .msh file, in its order: any numbers, with gaps, to which boundary conditions refer."""
+class _BoundedFile(io.BufferedReader):
+    """A Gmsh file for meshio, which counts down any number that stands alone on a line, over nothing in the end."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._most = max(path.stat().st_size, _MOST_STEPS)
+        self._ended = False
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        """The next line; ValueError for a count of more than the file holds, and the second time at its end."""
+        line = super().readline(size)
+        if line.strip().isdigit() and int(line) > self._most:
+            raise ValueError(f"the file cannot hold {int(line)} of anything")
+        if self._ended and not line:
+            raise ValueError("the file ends within a section")
+        self._ended = not line
+        return line
+
+
+def _node_numbers(path: Path) -> IntArray:
+    """Node tags (n,) of a .msh file, in its order: any numbers, with gaps, to which boundary conditions refer.
+
+    Counts are checked here, before meshio reserves memory for as many as they say.
+    """
     data = path.read_bytes()
     with damage_named(f"{path}: its $MeshFormat section"):
         version, mode, size = _section(data, b"MeshFormat").split()[:3]
@@ -78,19 +108,60 @@ def _node_numbers(path: Path, count: int) -> IntArray:
             f"{path}: Gmsh file version {version.decode(errors='replace')} is not supported, only 2.2 and 4.1. "
             "Save it again with Gmsh (Mesh.MshFileVersion = 4.1)."
         )
-
-    def read_tags(_: str) -> IntArray:
-        with path.open("rb") as file:  # meshio reads these numbers, and keeps them to itself
-            file.seek(_start(data, b"Nodes"))
-            if version == b"2.2":
-                return np.array(_gmsh22._read_nodes(file, mode == b"0")[1], dtype=np.int64)
-            return np.array(_gmsh41._read_nodes(file, mode == b"0", int(size))[1] + 1, dtype=np.int64)
-
-    tags: IntArray = _read(path, read_tags)
-    if len(tags) != count or len(np.unique(tags)) != count:
+    read_tags = _tags_of_22 if version == b"2.2" else _tags_of_41
+    tags: IntArray = _read(path, lambda _: read_tags(path, data, mode == b"0", int(size)))
+    if len(np.unique(tags)) != len(tags):
         different = len(np.unique(tags))
-        raise ImageFileError(f"{path}: {different} different node numbers for {count} nodes; the file is damaged.")
+        raise ImageFileError(f"{path}: {different} different node numbers for {len(tags)} nodes; the file is damaged.")
+    if len(tags) and not 0 < tags.min() <= tags.max() <= _HIGHEST_NUMBER:
+        raise ImageFileError(
+            f"{path}: nodes have numbers from {tags.min()} to {tags.max()}, and only 1 to {_HIGHEST_NUMBER} are "
+            "supported. Renumber the mesh in Gmsh, and save it again."
+        )
     return tags
+
+
+def _tags_of_22(path: Path, data: bytes, is_text: bool, _: int) -> IntArray:
+    if is_text:
+        for name in (b"Nodes", b"Elements"):
+            count, *rows = filter(None, map(bytes.strip, _section(data, name).splitlines()))
+            if int(count) != len(rows):
+                raise ValueError(f"{len(rows)} of {int(count)} {name.decode()}")
+    with _BoundedFile(path) as file:  # meshio reads these numbers, and keeps them to itself
+        file.seek(_start(data, b"Nodes"))
+        return np.array(_gmsh22._read_nodes(file, is_text)[1], dtype=np.int64)
+
+
+def _tags_of_41(path: Path, data: bytes, is_text: bool, size: int) -> IntArray:
+    with path.open("rb") as file:
+
+        def read(kind: npt.DTypeLike, count: int) -> npt.NDArray[Any]:
+            if count > len(data):
+                raise ValueError(f"the file cannot hold {count} of anything")
+            values = np.fromfile(file, kind, count, " " if is_text else "")
+            if len(values) < count:
+                raise ValueError(f"the file ends before {count} numbers")
+            return values
+
+        def blocks(name: bytes) -> Iterator[tuple[int, int]]:
+            """Kind and count of each block, whose items are read before the next one."""
+            file.seek(_start(data, name))
+            number, total, *_ = read(f"u{size}", 4).tolist()
+            for _ in range(number):
+                kind = int(read(np.intc, 3)[2])
+                count = int(read(f"u{size}", 1)[0])
+                yield kind, count
+                total -= count
+            if total:
+                raise ValueError(f"blocks of {name.decode()} do not add up")
+
+        tags = [np.empty(0, dtype=np.int64)]
+        for _, count in blocks(b"Nodes"):
+            tags.append(read(f"u{size}", count).astype(np.int64))
+            read(float, 3 * count)
+        for kind, count in blocks(b"Elements"):
+            read(f"u{size}", count * (1 + num_nodes_per_cell[_gmsh_to_meshio_type[kind]]))
+    return np.concatenate(tags)
 
 
 @contextmanager
@@ -137,6 +208,7 @@ def _read(path: Path, read: Callable[[str], Any]) -> Any:
     """Read a file by one of meshio's readers; refused if that fails, for whatever reason."""
     with silenced() as said, warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", "string or file could not be read to its end")
         try:
             return read(str(path))
         except Exception as error:

@@ -252,6 +252,39 @@ def test_an_ansys_archive_that_may_be_cut_after_a_block_is_told(
     assert "heel.cdb does not end in FINISH" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("kind", "old", "new", "message"),
+    [
+        ("msh-22", "$EndElements", '$EndElements\n$NodeData\n99999999999\n"u"', "cannot hold 99999999999 of anything"),
+        ("msh-22", "$Nodes\n27\n", "$Nodes\n26\n", "27 of 26 Nodes"),
+        ("msh-22", "$Elements\n50\n", "$Elements\n5\n", "50 of 5 Elements"),
+        ("msh-22", f"\n{TAGS[0]} ", f"\n{TAGS[0]}000000000 ", f"to {TAGS[0]}000000000, and only 1 to 100000000 are"),
+        ("msh-22", "$EndNodes", "$EndNode", "cannot be read as a mesh"),
+        ("msh-41", "$Nodes\n2 27 ", "$Nodes\n2 28 ", "blocks of Nodes do not add up"),
+        ("msh-41", "$Elements\n3 50 ", "$Elements\n3 49 ", "blocks of Elements do not add up"),
+        ("msh-41", "$Elements\n3 50 ", "$Elements\n999999999 50 ", "could not be read to its end"),
+        ("msh-41", "\n2 7 2 2 \n", "\n2 7 2 2000000000 \n", "cannot hold 8000000000 of anything"),
+    ],
+)
+def test_counts_that_a_mesh_file_cannot_hold_are_refused_at_once(
+    tmp_path: Path, kind: str, old: str, new: str, message: str
+) -> None:
+    path = written(tmp_path, kind)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ImageFileError, match=rf"heel\.{kind[:3]}: .*({message})"):
+        read_mesh(path)
+
+
+def test_the_name_of_a_gmsh_group_may_lack_its_quotes(tmp_path: Path) -> None:
+    path = written(tmp_path, "msh-41")
+    path.write_text(path.read_text().replace('"sole"', "sole"))
+    tets = read_mesh(path).tets
+    assert tets is not None
+    assert set(tets.facets) == {"sole"}
+
+
 def row(*numbers: int) -> str:
     return "".join(f"{n:9d}" for n in numbers)
 
