@@ -1,6 +1,5 @@
 """Stretch-stress curves of mechanical tests, and model parameters fitted to them, with confidence intervals."""
 
-import csv
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from scipy.stats import f as fisher, t as student
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
+from dvc.tables import read_table
 from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL
 from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
 
@@ -58,16 +58,8 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
         If the file cannot be read, a column is missing or ambiguous, or a value is not a number (the message gives its
         line).
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
-            columns = [c.strip().lower() for c in reader.fieldnames or []]
-    except (OSError, UnicodeDecodeError, csv.Error) as failure:
-        raise InputError(f"{path}: the curve cannot be read ({failure}).") from failure
+    columns, rows = read_table(Path(path))
     stress = [c for c in columns if c in _STRESS]
-    if len(columns) == 1 and ";" in columns[0]:
-        raise InputError(f"{path}: columns are separated by semicolons; use commas (and decimal points in numbers).")
     if "stretch" not in columns or len(stress) != 1:
         raise InputError(
             f"{path}: a curve needs a column 'stretch' (1 + strain) and exactly one of {', '.join(_STRESS)} (kind and "
@@ -81,8 +73,8 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
         )
     scale, true = _STRESS[stress[0]]
     tests: dict[str, list[tuple[float, float]]] = {}
-    for line, row in enumerate(rows, start=2):
-        cells = {(k or "").strip().lower(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
+    for line, row in rows:
+        cells = dict(zip(columns, row, strict=True))
         try:
             stretch, value = float(cells["stretch"]), scale * float(cells[stress[0]])
         except ValueError as failure:

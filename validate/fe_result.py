@@ -4,7 +4,6 @@ A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, 
 .inp, ANSYS .cdb) and a table of nodal displacements (.csv: node number, and three components).
 """
 
-import csv
 import json
 from dataclasses import dataclass
 from itertools import product
@@ -19,6 +18,7 @@ from dvc.deformation.nodal import OnMesh
 from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
+from dvc.tables import read_table, refuse_half_a_line
 from validate.rigid_parts import without_rigid_parts
 from validate.tetrahedra import linear_tetrahedra
 
@@ -185,12 +185,9 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
 
 
 def _from_table(place: Path, source: MeshFile) -> FloatArray:
-    try:
-        with place.open(newline="", encoding="utf-8-sig") as file:
-            head, *rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)] or [[]]
-    except (OSError, ValueError) as error:
-        raise InputError(f"{place}: the table cannot be read ({error}).") from error
-    named = [cell.strip(" '\"").casefold() for cell in head]
+    head, rows = read_table(place)
+    refuse_half_a_line(place)
+    named = [cell.strip(" '\"") for cell in head]
     node = next((n for n in _NODE_COLUMNS if n in named), None)
     parts = next((c for c in _COMPONENTS if set(c) <= set(named)), None)
     if node is None or parts is None:
@@ -200,17 +197,17 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
         )
     columns = [named.index(c) for c in (node, *parts)]
     try:
-        numbers = np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 4)
-    except (ValueError, IndexError) as error:
+        numbers = np.array([[float(row[c]) for c in columns] for _, row in rows]).reshape(-1, 4)
+    except ValueError as error:
         raise InputError(f"{place}: a row does not have a node and three numbers ({error}).") from error
     index = {int(n): i for i, n in enumerate(source.node_ids)}
-    ids = numbers[:, 0].astype(np.int64)
-    unknown = [int(n) for n in ids if int(n) not in index]
-    if unknown or len(np.unique(ids)) < len(ids):
-        what = f"node {unknown[0]}, which {source.path.name} does not have" if unknown else "a node twice"
+    ids = numbers[:, 0].tolist()
+    unknown = [n for n in ids if n not in index]
+    if unknown or len(set(ids)) < len(ids):
+        what = f"node {unknown[0]:.15g}, which {source.path.name} does not have" if unknown else "a node twice"
         raise InputError(f"{place} has {what}; table and mesh do not match.")
     u = np.full((len(source.node_ids), 3), np.nan)
-    u[[index[int(n)] for n in ids]] = numbers[:, 1:]
+    u[[index[n] for n in ids]] = numbers[:, 1:]
     return u
 
 

@@ -1,6 +1,5 @@
 """Strain location: clusters of tissue above a strain threshold, their overlap and distance, with 95 % intervals."""
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -18,6 +17,7 @@ from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import faces_of
+from dvc.tables import read_table
 from dvc.trust.error_model import widened
 
 LEAST_ML = 0.1
@@ -42,15 +42,14 @@ def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
     """Read thresholds from a CSV table; by default the one in the package.
 
     Columns are max_shear, a maximum shear strain (E1 - E3) / 2 between 0 and 3 (not in percent), and source, a text.
-    InputError if a column is missing or the table has no row.
+    InputError as `dvc.tables.read_table`, and if a column is missing or the table has no row.
     """
-    place = path if path is not None else files("validate") / "thresholds.csv"
+    place = path if path is not None else Path(str(files("validate") / "thresholds.csv"))
+    columns, rows = read_table(place)
     try:
-        rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
-        thresholds = tuple(Threshold(float(row["max_shear"]), row["source"].strip()) for row in rows)
-    except OSError as error:
-        raise InputError(f"{place}: the thresholds cannot be read ({error.strerror}).") from error
-    except (KeyError, ValueError, AttributeError) as error:
+        value, source = columns.index("max_shear"), columns.index("source")
+        thresholds = tuple(Threshold(float(row[value]), row[source]) for _, row in rows)
+    except ValueError as error:
         raise InputError(f"{place}: a table of thresholds needs the columns max_shear and source ({error}).") from error
     if not thresholds or not all(0.0 < t.max_shear < 3.0 for t in thresholds):
         raise InputError(

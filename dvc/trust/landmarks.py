@@ -13,6 +13,7 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
 from dvc.errors import ImageFileError, InputError
+from dvc.tables import read_table, read_text, refuse_half_a_line
 
 _log = logging.getLogger(__name__)
 
@@ -49,9 +50,10 @@ def read_landmarks(
     Raises
     ------
     InputError
-        If the frame or the kind of file is not one of those above, or two point lists do not match.
+        If the frame or the kind of file is not one of those above, a file cannot be read as text, a row of the table is
+        incomplete, or two point lists do not match.
     ImageFileError
-        If a file is missing or damaged, a column or number is missing, or its frame or unit is not known.
+        If a file is damaged, a column or number is missing, or its frame or unit is not known.
     """
     if frame not in _TO_LPS:
         raise InputError(f"The frame of landmarks must be LPS or RAS; got {frame!r}.")
@@ -64,17 +66,16 @@ def read_landmarks(
             ".fcsv): first that of the unloaded image, then that of the loaded one."
         )
     pairs, names = [], []
-    rows = csv.DictReader(_text(file).splitlines())
-    header = [str(name).strip().casefold() for name in rows.fieldnames or []]
+    header, rows = read_table(file)
     if missing := [name for name in _COLUMNS if name not in header]:
         raise ImageFileError(
             f"{file}: the column {missing[0]} is missing. The first line must name the columns "
             f"{', '.join(_COLUMNS)}; it has: {', '.join(header) or 'nothing'}."
         )
-    rows.fieldnames = header
-    for count, row in enumerate(rows, start=1):
-        pairs.append([_number(f"{file}, line {rows.line_num}", name, row[name]) for name in _COLUMNS])
-        names.append((row.get("name") or str(count)).strip())
+    for count, (line, cells) in enumerate(rows, start=1):
+        row = dict(zip(header, cells, strict=True))
+        pairs.append([_number(f"{file}, line {line}", name, row[name]) for name in _COLUMNS])
+        names.append(row.get("name") or str(count))
     if not pairs:
         raise ImageFileError(f"{file}: no landmarks below the header line.")
     reference, deformed = np.split(np.array(pairs), 2, axis=1)
@@ -147,7 +148,7 @@ def _slicer_points(path: Path) -> _Points:
 
 def _from_markups(path: Path) -> _Points:
     try:
-        (markup,) = json.loads(_text(path))["markups"]
+        (markup,) = json.loads(read_text(path))["markups"]
         frame, unit = str(markup["coordinateSystem"]), markup.get("coordinateUnits", "mm")
         listed: list[dict[str, Any]] = list(markup["controlPoints"])
     except (ValueError, KeyError, TypeError) as error:
@@ -168,7 +169,7 @@ def _from_markups(path: Path) -> _Points:
 
 
 def _from_fcsv(path: Path) -> _Points:
-    lines = [(line, text) for line, text in enumerate(_text(path).splitlines(), start=1) if text.strip()]
+    lines = [(line, text) for line, text in enumerate(read_text(path).splitlines(), start=1) if text.strip()]
     head = [text.removeprefix("#").partition("=") for _, text in lines if text.startswith("#")]
     header = {key.strip(): value.strip() for key, _, value in head}
     frame = _FCSV_FRAMES.get(header.get("CoordinateSystem", ""))
@@ -178,9 +179,14 @@ def _from_fcsv(path: Path) -> _Points:
         if frame is None or not {"x", "y", "z"} <= set(columns):
             what = "the header lacks the frame (CoordinateSystem = LPS or RAS) or the columns"
             raise ImageFileError(f"{path}: {what}. Save the list again in Slicer.")
-        row = dict(zip(columns, next(csv.reader([text])), strict=False))
+        cells = next(csv.reader([text]), [])
+        if len(cells) < len(columns):
+            count = f"{len(cells)} of {len(columns)} columns"
+            raise ImageFileError(f"{path}, line {line}: the row has {count}; the file is incomplete.")
+        row = dict(zip(columns, cells, strict=False))
         position = np.array([_number(f"{path}, line {line}", axis, row.get(axis)) for axis in "xyz"])
         points.append((row.get("label") or str(len(points) + 1), position * _TO_LPS[frame]))
+    refuse_half_a_line(path)
     return points
 
 
@@ -192,10 +198,3 @@ def _number(where: str, name: str, value: object) -> float:
     if not math.isfinite(number):
         raise ImageFileError(f"{where}: {name} must be a finite number in mm; got {value!r}.")
     return number
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ImageFileError(f"{path}: cannot be read as text ({error}).") from error

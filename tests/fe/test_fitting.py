@@ -160,6 +160,7 @@ def test_an_unstable_fit_is_reported() -> None:
         ("stretch,nominal_stress_kpa\n1.1,2\n", None, "the kind of test is missing"),
         ("stretch,nominal_stress_kpa\n1.1,two\n", "uniaxial", r"line 2: could not convert"),
         ("stretch,nominal_stress_kpa\n1.1,2\n-1,2\n", "uniaxial", r"line 3: the stretch must be positive"),
+        ("stretch,nominal_stress_kpa\n1.1,2\n1.2\n", "uniaxial", r"line 3: the row has 1 cells, but the header has 2"),
         ("stretch,nominal_stress_kpa\n1.1,nan\n", "uniaxial", r"line 2: .*finite"),
         ("stretch,nominal_stress_kpa,test\n1.1,2,biaxial\n", None, r"line 2: unknown test 'biaxial'"),
         ("stretch,nominal_stress_kpa\n", "uniaxial", "no rows below the header"),
@@ -190,5 +191,5 @@ def test_curves_that_tell_nothing_are_refused() -> None:
     bent = np.linspace(1.0, 1.5, 20)
     with pytest.raises(InputError, match="not a valid material"):
         fit([Curve("uniaxial", bent, (bent - 1.0) ** 3 - 0.02 * (bent - 1.0))], "Yeoh")
-    with pytest.raises(InputError, match=r"nowhere.*the curve cannot be read"):
+    with pytest.raises(InputError, match=r"nowhere.*cannot be read"):
         read_curves("nowhere.csv", "uniaxial")

@@ -388,7 +388,7 @@ def test_thresholds_are_a_table_with_sources(tmp_path) -> None:
     own = tmp_path / "mine.csv"
     own.write_text("max_shear,source\n0.4,a paper\n")
     assert read_thresholds(own) == (Threshold(0.4, "a paper"),)
-    for text in ("max_shear\n0.4\n", "max_shear,source\n-1,x\n", "max_shear,source\n"):
+    for text in ("max_shear\n0.4\n", "max_shear,source\n-1,x\n", "max_shear,source\n", "max_shear,source\nnan,x\n"):
         own.write_text(text)
         with pytest.raises(InputError, match="thresholds"):
             read_thresholds(own)

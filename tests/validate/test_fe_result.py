@@ -201,6 +201,16 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
         table(files["path"], rows, moved(points)[: len(rows)], head)
         with pytest.raises(InputError, match=message):
             read_result("heel", files["path"], mesh=files["mesh"])
+    text = table(files["path"], TAGS, moved(points)).read_text()
+    for damaged, message in (
+        (text.removesuffix("\n"), "ends in the middle of a line"),
+        (text.replace(f"\n{TAGS[3]},", f"\n{TAGS[3]}.5,"), rf"has node {TAGS[3]}\.5, which"),
+        (text.replace(f"\n{TAGS[3]},", "\nnan,"), "has node nan, which"),
+        (text.partition("\n")[0] + "\n", "27 of 27 nodes have no displacement"),
+    ):
+        files["path"].write_text(damaged)
+        with pytest.raises(InputError, match=message):
+            read_result("heel", files["path"], mesh=files["mesh"])
     table(files["path"], TAGS, 1000.0 * moved(points))
     with pytest.raises(InputError, match="largest displacement"):
         read_result("heel", files["path"], mesh=files["mesh"])

@@ -1,6 +1,5 @@
 """Masks and label maps: reading them, their names, and bringing them onto an image's grid."""
 
-import csv
 import logging
 import re
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from dvc.images.image import Grid, LabelMap, Mask
 from dvc.io import StrPath
 from dvc.io.images.read import read_voxels
 from dvc.io.images.text_headers import nrrd_fields
+from dvc.tables import read_table, read_text, refuse_half_a_line
 
 _log = logging.getLogger("dvc.images")
 
@@ -105,19 +105,19 @@ def read_names(path: StrPath) -> dict[int, str]:
     structure). ITK-SNAP: ``index r g b a visible mesh "name"``. Slicer: ``index name r g b a``. Label 0 has no name.
     """
     place = Path(path)
-    try:
-        text = place.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{place}: the table of label names cannot be read ({type(error).__name__}).") from error
-    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("#")]
-    is_csv = place.suffix.lower() == ".csv"
-    rows = _csv_names(lines) if is_csv else [_table_name(line) for line in lines]
+    if is_csv := place.suffix.lower() == ".csv":
+        lines, rows = [], _csv_names(*read_table(place))
+    else:
+        lines = [line.strip() for line in read_text(place).splitlines() if line.strip() and not line.startswith("#")]
+        rows = [_table_name(line) for line in lines]
     if not rows or None in rows:
         wrong = "" if is_csv or not rows else f" (line: {lines[rows.index(None)][:60]!r})"
         raise InputError(
             f"{place}: not a table of labels and names{wrong}. Supported: CSV with a header line 'label,name', "
             "ITK-SNAP label descriptions, Slicer colour tables."
         )
+    if not is_csv:
+        refuse_half_a_line(place)
     names: dict[int, str] = {}
     for value, name in filter(None, rows):
         if value in names:
@@ -278,19 +278,16 @@ def _segment_names(path: Path) -> dict[int, str]:
     }
 
 
-def _csv_names(lines: list[str]) -> list[tuple[int, str] | None]:
+def _csv_names(columns: list[str], rows: list[tuple[int, list[str]]]) -> list[tuple[int, str] | None]:
     """Labels and names of a table; none if a column is missing, None for a row without a label."""
-    rows = list(csv.reader(lines))
-    columns = [cell.strip().lower() for cell in rows[0]] if rows else []
     name = next((columns.index(c) for c in _NAME_COLUMNS if c in columns), None)
     label = next((columns.index(c) for c in _LABEL_COLUMNS if c in columns and columns.index(c) != name), None)
     if name is None or label is None:
         return []
-    whole = [len(row) > max(name, label) and row[label].strip().isdigit() for row in rows[1:]]
-    return [(int(row[label]), row[name].strip()) if ok else None for row, ok in zip(rows[1:], whole, strict=True)]
+    return [(int(row[label]), row[name]) if row[label].isdecimal() else None for _, row in rows]
 
 
 def _table_name(line: str) -> tuple[int, str] | None:
-    match = re.fullmatch(r'(\d+)(?:\s+[\d.]+){6}\s+"(.*)"', line)  # ITK-SNAP
-    match = match or re.fullmatch(r"(\d+)\s+(\S.*?)(?:\s+[\d.]+){4}", line)  # Slicer
+    match = re.fullmatch(r'([0-9]+)(?:\s+[\d.]+){6}\s+"(.*)"', line)  # ITK-SNAP
+    match = match or re.fullmatch(r"([0-9]+)\s+(\S.*?)(?:\s+[\d.]+){4}", line)  # Slicer
     return (int(match[1]), match[2].strip()) if match else None

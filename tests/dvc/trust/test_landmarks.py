@@ -108,14 +108,17 @@ def test_lists_that_match_in_part_are_refused(tmp_path: Path, names: tuple[str, 
         ("", "column x0 is missing.*it has: nothing"),
         ("x0,y0,z0,x1,y1\n1,2,3,4,5\n", "column z1 is missing.*it has: x0, y0"),
         ("x0,y0,z0,x1,y1,z1\n", "no landmarks below the header line"),
-        ("x0,y0,z0,x1,y1,z1\n1,2,3,4,5,6\n1,2,3,4,5\n", r"pairs\.csv, line 3: z1 must be .* None"),
+        (
+            "x0,y0,z0,x1,y1,z1\n1,2,3,4,5,6\n1,2,3,4,5\n",
+            r"pairs\.csv, line 3: the row has 5 cells, but the header has 6",
+        ),
         ("x0,y0,z0,x1,y1,z1\n1,2,nan,4,5,6\n", "line 2: z0 must be a finite number"),
-        ("x0;y0;z0;x1;y1;z1\n1;2;3;4;5;6\n", "column x0 is missing"),
+        ("x0;y0;z0;x1;y1;z1\n1;2;3;4;5;6\n", "separated by semicolons"),
     ],
 )
 def test_a_damaged_table_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "pairs.csv").write_text(text)
-    with pytest.raises(ImageFileError, match=message):
+    with pytest.raises(InputError, match=message):
         read_landmarks(tmp_path / "pairs.csv")
 
 
@@ -153,8 +156,19 @@ def test_what_tells_no_frame_or_is_another_kind_of_file_is_refused(tmp_path: Pat
         read_landmarks(good)
     with pytest.raises(InputError, match="LPS or RAS; got 'ijk'"):
         read_landmarks(tmp_path / "pairs.csv", frame="ijk")
-    with pytest.raises(ImageFileError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         read_landmarks(tmp_path / "missing.csv")
+
+
+def test_a_list_of_slicer_that_is_cut_in_a_line_is_refused(tmp_path: Path) -> None:
+    path = fcsv(tmp_path / "a.fcsv", X, "LPS")
+    text = path.read_text().removesuffix("\n")
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"a\.fcsv: the file may be incomplete: it ends in the middle of a line"):
+        read_landmarks((path, path))
+    path.write_text(text.rpartition(",")[0] + "\n")
+    with pytest.raises(ImageFileError, match=r"a\.fcsv, line 6: the row has 13 of 14 columns; the file is incomplete"):
+        read_landmarks((path, path))
 
 
 def test_the_error_is_the_distance_between_prediction_and_landmark() -> None:

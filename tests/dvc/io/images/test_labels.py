@@ -193,16 +193,23 @@ class TestNames:
             ("a.csv", ""),
             ("a.csv", "1,fat\n2,skin\n"),
             ("a.csv", "label,name\nfat,1\n"),
-            ("a.csv", "label,name\n1\n"),
+            ("a.csv", "label,name\n\u00b2,fat\n"),
             ("a.csv", "label,colour\n1,red\n"),
             ("a.txt", "fat and skin\n"),
             ("a.txt", "1 fat 255 0 0 255\nskin\n"),
+            ("a.txt", "\u00b2 fat 255 0 0 255\n"),
             ("a.txt", ""),
         ],
     )
     def test_other_tables_are_refused(self, tmp_path: Path, name: str, text: str) -> None:
-        (tmp_path / name).write_text(text)
+        (tmp_path / name).write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match="not a table of labels and names"):
+            read_names(tmp_path / name)
+
+    @pytest.mark.parametrize(("name", "text"), [("a.ctbl", "1 fat 255 0 0 25"), ("a.csv", 'label,name\n3,"mus')])
+    def test_a_table_cut_in_a_line_is_refused(self, tmp_path: Path, name: str, text: str) -> None:
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=rf"{name}.*(ends in the middle of a line|unexpected end of data)"):
             read_names(tmp_path / name)
 
     def test_a_label_named_twice(self, tmp_path: Path) -> None:
