@@ -106,7 +106,10 @@ def read_result(
         raise InputError(f"{place}: a table of displacements also needs the mesh of its nodes; give the mesh file.")
     source = read_mesh((is_table and mesh) or place, unit=unit, frame=frame)
     u = (_from_table if is_table else _beside_mesh)(place, source) * MM_PER_UNIT[unit] * TO_LPS[frame]
-    tets, carry = linear_tetrahedra(source)
+    try:
+        tets, carry = linear_tetrahedra(source)
+    except GeometryError as error:
+        raise GeometryError(f"{source.path}: {error}") from error
     used = np.unique(carry.indices)
     missing = used[~np.isfinite(u[used]).all(axis=1)]
     if len(missing):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh, read_mesh
@@ -45,7 +46,7 @@ EARLY = {
 }
 # Elements of which the file has more nodes than are taken, or shells and beams that CalculiX has expanded to solids,
 # whose nodes are new: the others are compared.
-FEWER = {"febio/hex27.xplt", "febio/tet15.xplt", *(f"calculix/{name}.frd" for name in ("shell", "shell8", "beam"))}
+FEWER = {"febio/tet15.xplt", *(f"calculix/{name}.frd" for name in ("shell", "shell8", "beam"))}
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +81,15 @@ def test_displacements_are_those_that_the_code_printed(folder: Path, name: str) 
     np.testing.assert_allclose(u[[place for place, _ in known]], theirs, rtol=2e-6, atol=2e-6)
     result = read_result("model", folder / name)
     assert np.abs(result.deformation.u_mm).max() == pytest.approx(np.linalg.norm(theirs, axis=1).max(), rel=0.75)
+
+
+@pytest.mark.parametrize("name", ["febio/hex27.xplt", "febio/hex20.xplt", "calculix/c3d20.frd"])
+def test_every_node_of_a_quadratic_brick_keeps_its_displacement(folder: Path, name: str) -> None:
+    """Those at the middles of faces and cells too, which could be interpolated from the others."""
+    of_file, result = read_mesh(folder / name), read_result("model", folder / name)
+    distance, node = cKDTree(result.mesh.points_mm).query(of_file.points_mm)
+    np.testing.assert_allclose(distance, 0.0, atol=1e-9)
+    np.testing.assert_allclose(result.deformation.u_mm[node], of_file.at_nodes["displacement"], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", REFUSED)

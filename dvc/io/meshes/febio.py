@@ -7,6 +7,7 @@ chunks (FEBio's binary database, versions 2.0 to 3.5, FEBio 3 and 4); states may
 import logging
 import struct
 import zlib
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,15 +32,18 @@ _NODE_DATA, _TIME, _STATUS = (0x02020000, 0x02020300), (0x02010000, 0x02010002),
 _NO_STEPS_END = 2  # status of a state that is written at another event: an iteration, or the end of the run
 _VARIABLE_ID, _VARIABLE_DATA = 0x02020002, 0x02020003
 _DISPLACEMENT = "displacement"
+_PIECE = 1 << 16
 
 # Of FEBio's number of the element type: nodes in the file, and the kind in meshio's names with those that are taken.
-# Bricks of 27 and tetrahedra of 15 nodes begin with the nodes of those of 20 and 10.
+# Tetrahedra of 15 nodes begin with the nodes of those of 10.
 _KINDS = {
     0: (8, "hexahedron", 8), 1: (6, "wedge", 6), 2: (4, "tetra", 4), 3: (4, "quad", 4), 4: (3, "triangle", 3),
-    6: (20, "hexahedron20", 20), 7: (10, "tetra10", 10), 8: (15, "tetra10", 10), 9: (27, "hexahedron20", 20),
+    6: (20, "hexahedron20", 20), 7: (10, "tetra10", 10), 8: (15, "tetra10", 10), 9: (27, "hexahedron27", 27),
     10: (6, "triangle6", 6), 11: (8, "quad8", 8), 12: (9, "quad9", 9), 13: (15, "wedge15", 15),
     16: (5, "pyramid", 5), 17: (5, "tetra", 4), 18: (13, "pyramid13", 13),
 }  # fmt: skip
+# FEBio has the middles of the upright faces one after the other, VTK those of opposite faces.
+_ORDER = {"hexahedron27": [*range(20), 23, 21, 20, 22, 24, 25, 26]}
 
 
 def read_xplt(path: Path) -> RawMesh:
@@ -74,12 +78,14 @@ def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
             yield tag, data[at + 8 : at + 8 + size]
             at += 8 + size
         else:
-            stream = zlib.decompressobj()
-            plain = stream.decompress(data[at:])
+            stream, plain = zlib.decompressobj(), bytearray()
+            while not stream.eof and at < len(data):  # a piece at a time: what is left over is copied
+                plain += stream.decompress(data[at : at + _PIECE])
+                at = min(at + _PIECE, len(data))
             if not stream.eof:
                 raise ValueError("the last section is incomplete")
-            yield from _chunks(plain)
-            at = len(data) - len(stream.unused_data)
+            yield from _chunks(bytes(plain))
+            at -= len(stream.unused_data)
 
 
 def _chunks(body: bytes) -> Iterator[tuple[int, bytes]]:
@@ -134,7 +140,8 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
         rows = np.frombuffer(_at(domain, _ELEMENTS), "<u4").reshape(-1, width + 3)
         if not ((rows[:, 0] == _ELEMENT).all() and (rows[:, 1] == 4 * (width + 1)).all()):
             raise ValueError(f"an element in a domain of {kind} has a wrong number of nodes")
-        blocks.append((kind, rows[:, 3 : 3 + taken].astype(np.int64)))
+        nodes = rows[:, 3 : 3 + taken].astype(np.int64)
+        blocks.append((kind, nodes[:, _ORDER[kind]] if kind in _ORDER else nodes))
         name = names.get(part) or f"part {part}"
         parts.setdefault(name, []).append(np.arange(known, known + len(rows)))
         known += len(rows)
@@ -144,8 +151,8 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
 def time_reached(path: Path) -> float | None:
     """The time of the last state in a plot file; None where it has none."""
     with damage_named(f"{path}: its sections"):
-        states = [body for tag, body in _sections(path.read_bytes()) if tag == _STATE]
-        time = _at(states[-1], *_TIME) if states else b""
+        last = deque((body for tag, body in _sections(path.read_bytes()) if tag == _STATE), maxlen=1)
+        time = _at(last[0], *_TIME) if last else b""
         return float(np.float32(struct.unpack("<f", time)[0])) if time else None
 
 

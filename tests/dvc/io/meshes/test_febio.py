@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvc.errors import ImageFileError, InputError
+from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.io.meshes.read import read_mesh
 from tests.meshfiles import block, skin
 from tests.validate.test_quadratic_cells import quadratic, reference
@@ -116,19 +116,24 @@ def test_a_last_state_that_may_not_be_converged_is_told(
     assert all(word in one for word, one in zip(words, said, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("number", "kind", "more"), [(6, "hexahedron20", 0), (9, "hexahedron20", 7), (13, "wedge15", 0)]
-)
-def test_quadratic_elements(tmp_path: Path, number: int, kind: str, more: int) -> None:
+@pytest.mark.parametrize(("number", "kind"), [(6, "hexahedron20"), (9, "hexahedron27"), (13, "wedge15")])
+def test_quadratic_elements(tmp_path: Path, number: int, kind: str) -> None:
     points = 10.0 * reference(kind) + 5.0
-    extra = points[:more] + 0.1  # the middles of faces and body of the brick of 27 nodes, which are not used
-    every = np.concatenate([points, extra])
+    if kind == "hexahedron27":  # FEBio lists the faces y-, x+, y+, x-, and then z-, z+
+        points = points[[*range(20), 22, 21, 23, 20, 24, 25, 26]]
     path = write_xplt(
-        tmp_path / "Load1.xplt", every, [domain(number, 1, np.arange(len(every))[None])], quadratic(every)
+        tmp_path / "Load1.xplt", points, [domain(number, 1, np.arange(len(points))[None])], quadratic(points)
     )
     result = read_result("febio", path)
     assert np.abs(result.deformation.u_mm - quadratic(result.mesh.points_mm)).max() < 1e-4
-    assert len(result.mesh.cells) == {"hexahedron20": 48, "wedge15": 32}[kind]
+    assert len(result.mesh.cells) == {"hexahedron20": 48, "hexahedron27": 48, "wedge15": 32}[kind]
+
+
+def test_a_folded_element_is_refused_with_its_file(tmp_path: Path) -> None:
+    points = 10.0 * reference("hexahedron20")[:8]
+    path = write_xplt(tmp_path / "Load1.xplt", points, [domain(0, 1, np.array([[0, 1, 2, 3, 4, 5, 6, 3]]))], points)
+    with pytest.raises(GeometryError, match=r"Load1\.xplt: 1 hexahedron cells are folded"):
+        read_result("febio", path)
 
 
 def test_what_is_damaged_or_another_is_refused(tmp_path: Path) -> None:
