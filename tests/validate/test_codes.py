@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh, read_mesh
-from dvc.errors import MrstrainError
+from dvc.errors import ImageFileError, MrstrainError
 from tests.blocks import block
 from validate import read_result
 from validate.rigid_parts import without_rigid_parts
@@ -90,6 +90,31 @@ def test_every_node_of_a_quadratic_brick_keeps_its_displacement(folder: Path, na
     distance, node = cKDTree(result.mesh.points_mm).query(of_file.points_mm)
     np.testing.assert_allclose(distance, 0.0, atol=1e-9)
     np.testing.assert_allclose(result.deformation.u_mm[node], of_file.at_nodes["displacement"], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["shell", "shell8", "beam", "shell2d"])
+def test_shells_and_beams_that_calculix_expanded_are_no_tissue(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    """The deck tells them; without it, the node numbers of a shell do, of which an ordinary mesh has none."""
+    result = read_result("model", folder / f"calculix/{name}.frd")
+    np.testing.assert_allclose(result.mesh.bounds_mm, [[0.0, 0.0, 0.0], [20.0, 20.0, 20.0]], atol=1e-9)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    alone = tmp_path / f"{name}.frd"
+    alone.write_bytes((folder / f"calculix/{name}.frd").read_bytes())
+    read_result("model", alone)
+    assert (f"{name}.frd: 1 elements may be shells" in caplog.text) == name.startswith("shell") ^ (name == "shell2d")
+
+
+@pytest.mark.parametrize("name", ["c3d8", "c3d20", "c3d6", "c3d15"])
+def test_solids_are_no_expanded_shells(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    alone = tmp_path / f"{name}.frd"
+    alone.write_bytes((folder / f"calculix/{name}.frd").read_bytes())
+    whole = read_mesh(folder / f"calculix/{name}.frd")
+    assert read_mesh(alone).cell_count == whole.cell_count > 0
+    assert not caplog.text
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -167,6 +192,19 @@ def test_a_run_that_failed_before_its_first_state_has_no_time(folder: Path, tmp_
     (tmp_path / "Load1.xplt").write_bytes(whole[:at])
     (tmp_path / "Load1.log").write_text("E R R O R   T E R M I N A T I O N")
     assert early_end(tmp_path / "Load1.xplt") == ("ended with ERROR TERMINATION (Load1.log)", True)
+
+
+def test_a_time_that_is_no_number_is_refused(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "calculix/c3d4.frd").read_text()
+    (tmp_path / "Load1.frd").write_text(text.replace("105 1.000000000", "105         inf"))
+    with pytest.raises(ImageFileError, match=r"Load1\.frd: a head of results cannot be read \(inf is no number"):
+        early_end(tmp_path / "Load1.frd")
+    time = struct.pack("<IIf", 0x02010002, 4, 1.0)
+    data = (folder / "febio/tet4.xplt").read_bytes()
+    assert data.count(time) == 1
+    (tmp_path / "Load1.xplt").write_bytes(data.replace(time, struct.pack("<IIf", 0x02010002, 4, np.nan)))
+    with pytest.raises(ImageFileError, match=r"Load1\.xplt: .*nan is no number"):
+        early_end(tmp_path / "Load1.xplt")
 
 
 def test_without_log_and_deck_a_time_that_is_not_whole_is_doubted(folder: Path, tmp_path: Path) -> None:

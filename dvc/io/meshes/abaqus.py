@@ -32,7 +32,9 @@ _ELSEWHERE = {"INCLUDE", "SYSTEM", "NGEN", "NCOPY", "NFILL", "ELGEN", "ELCOPY", 
 
 
 @dataclass(slots=True)
-class _Keyword:
+class Keyword:
+    """A keyword of an input file: its line, name and options in capitals, and the cells of its rows."""
+
     line: int
     name: str
     options: dict[str, str]
@@ -48,7 +50,7 @@ def read_abaqus(path: Path) -> RawMesh:
     element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
     parts, in_assembly = 0, False
     opened: dict[str, str] = {}
-    for keyword in _keywords(path):
+    for keyword in keywords(path):
         where = f"{path}, *{keyword.name} in line {keyword.line}"
         parts += keyword.name == "PART"
         if keyword.name in _CLOSED:
@@ -84,10 +86,10 @@ def read_abaqus(path: Path) -> RawMesh:
     return mesh.by_index(element_sets.resolved(), node_sets.resolved())
 
 
-def _keywords(path: Path) -> Iterator[_Keyword]:
+def keywords(path: Path) -> Iterator[Keyword]:
     """Yield the keywords with their options and data rows; comments left out, continued heads joined."""
     text = read_text(path)
-    current: _Keyword | None = None
+    current: Keyword | None = None
     head, head_line = "", 0
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip()
@@ -103,7 +105,7 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
                 name, *options = (part.strip() for part in head[1:].split(","))
                 pairs = [option.partition("=") for option in options if option]
                 named = {key.strip().upper(): value.strip() for key, _, value in pairs}
-                current, head = _Keyword(head_line, name.upper(), named), ""
+                current, head = Keyword(head_line, name.upper(), named), ""
         elif current is not None:
             current.rows.append([x.strip() for x in line.rstrip(",").split(",")])
     if current is not None:
@@ -114,7 +116,7 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
         yield current
 
 
-def _refuse_what_lies_elsewhere(where: str, keyword: _Keyword, parts: int) -> None:
+def _refuse_what_lies_elsewhere(where: str, keyword: Keyword, parts: int) -> None:
     reason = None
     if parts > 1:
         reason = "is a second part"
@@ -129,7 +131,7 @@ def _refuse_what_lies_elsewhere(where: str, keyword: _Keyword, parts: int) -> No
         raise ImageFileError(f"{where} {reason}, which is not supported. {advice}")
 
 
-def _add_elements(where: str, keyword: _Keyword, mesh: NumberedMesh) -> list[int]:
+def _add_elements(where: str, keyword: Keyword, mesh: NumberedMesh) -> list[int]:
     """Add the elements of a keyword, if they are of a kind that is read, and give their numbers."""
     kind = keyword.options["TYPE"].upper()
     stems = [s for s in _SHAPES if kind.startswith(s) and set(kind[len(s) :]) <= _VARIANTS]
@@ -165,7 +167,7 @@ class _Sets:
             str, tuple[str, list[str | range]]
         ] = {}  # names are the same in any case; the first spelling is kept
 
-    def extend(self, keyword: _Keyword, more: Iterable[str | range]) -> None:
+    def extend(self, keyword: Keyword, more: Iterable[str | range]) -> None:
         if self._kind not in keyword.options:
             raise ImageFileError(f"{self._path}, line {keyword.line}: *{self._kind} without a name ({self._kind}=...).")
         name = keyword.options[self._kind].strip('"')

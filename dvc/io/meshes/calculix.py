@@ -1,11 +1,15 @@
 """CalculiX results (.frd, ASCII): nodes, elements and the last step's displacements, with the file's own numbers."""
 
+import logging
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 from dvc.errors import ImageFileError
-from dvc.io.meshes.raw import NumberedMesh, RawMesh, damage_named
+from dvc.io.meshes.abaqus import keywords
+from dvc.io.meshes.raw import NumberedMesh, RawMesh, damage_named, finite
+
+_log = logging.getLogger("dvc.io.meshes.calculix")
 
 # Shape in meshio's names by CalculiX' number of the element type.
 _SHAPES = {
@@ -17,12 +21,18 @@ _ORDER = {
     "hexahedron20": [*range(12), *range(16, 20), *range(12, 16)],
     "wedge15": [*range(9), *range(12, 15), *range(9, 12)],
 }
+# Where a solid's lower and its upper nodes begin, of those between which a shell that was expanded has none.
+_LAYERS = {"hexahedron": (0, 4), "wedge": (0, 3), "hexahedron20": (8, 12), "wedge15": (6, 9)}
 _NODE, _VALUE = 10, 12  # columns of a number of a node, and of a value
 _TIME, _ANALYSIS, _IN_TIME = slice(12, 24), slice(56, 58), (0, 1)  # of the head of results; static and transient
 
 
 def read_frd(path: Path) -> RawMesh:
-    """Read a result file: its regions are the materials ("material 1"), its field the last step's displacement."""
+    """Read a result file: its regions are the materials ("material 1"), its field the last step's displacement.
+
+    CalculiX expands shells, membranes and beams to solids. They are left out if the deck lies beside the result, with
+    its name; without the deck, what has the node numbers of a shell is told. Both are logged.
+    """
     try:
         text = path.read_text(encoding="ascii")
     except (UnicodeDecodeError, OSError) as error:
@@ -40,7 +50,7 @@ def read_frd(path: Path) -> RawMesh:
                 for row in _rows(path, lines, "nodes"):
                     mesh.add_node(int(row[3:13]), _values(row))
             elif line.startswith("    3C"):
-                _add_elements(_rows(path, lines, "elements"), mesh, materials)
+                _add_elements(_rows(path, lines, "elements"), mesh, materials, _no_solids(path.with_suffix(".inp")))
             elif line.startswith(" -4  DISP"):
                 rows = [row for row in _rows(path, lines, "displacements") if row.startswith(" -1")]
                 at_nodes = {"displacement": {int(row[3:13]): _values(row) for row in rows}}
@@ -53,7 +63,7 @@ def time_reached(path: Path) -> float | None:
     with path.open("rb") as file, damage_named(f"{path}: a head of results"):
         for line in file:
             if line.startswith(b"  100C") and int(line[_ANALYSIS]) in _IN_TIME:
-                times.append(float(line[_TIME]))
+                times.append(finite(float(line[_TIME])))
     return max(times, default=None)
 
 
@@ -74,12 +84,47 @@ def _values(row: str) -> list[float]:
     return [float(row[start : start + _VALUE]) for start in starts]
 
 
-def _add_elements(rows: list[str], mesh: NumberedMesh, materials: dict[str, list[int]]) -> None:
+def _add_elements(
+    rows: list[str], mesh: NumberedMesh, materials: dict[str, list[int]], no_solids: set[int] | None
+) -> None:
+    left_out = alike = 0
     starts = [n for n, row in enumerate(rows) if row.startswith(" -1")]
     for start, end in pairwise([*starts, len(rows)]):
         head = rows[start]
         number, shape = int(head[3:13]), _SHAPES[int(head[13:18])]
         nodes = [int(row[i : i + _NODE]) for row in rows[start + 1 : end] for i in range(3, len(row.rstrip()), _NODE)]
         order = _ORDER.get(shape, range(len(nodes)))
-        mesh.add_element(number, shape, [nodes[i] for i in order] if len(order) == len(nodes) else nodes)
+        nodes = [nodes[i] for i in order] if len(order) == len(nodes) else nodes
+        if shape in _LAYERS and number in (no_solids or ()):
+            left_out += 1
+            continue
+        alike += no_solids is None and _like_a_shell(shape, nodes, mesh)
+        mesh.add_element(number, shape, nodes)
         materials.setdefault(f"material {int(head[23:28])}", []).append(number)
+    if left_out:
+        _log.info("%s: %d shells, membranes or beams, expanded to solids, are left out.", mesh.path, left_out)
+    if alike:
+        _log.warning(
+            "%s: %d elements may be shells that CalculiX expanded to solids, and count as tissue. Put the deck (%s) "
+            "beside the result, or write it with OUTPUT=2D.",
+            mesh.path, alike, mesh.path.with_suffix(".inp").name,
+        )  # fmt: skip
+
+
+def _like_a_shell(shape: str, nodes: list[int], mesh: NumberedMesh) -> bool:
+    """Whether nodes have the numbers of a shell's: lower, middle and upper in a row, and no middle one in the file."""
+    low, high = _LAYERS.get(shape, (0, 0))
+    pairs = [*zip(nodes[low:high], nodes[high : 2 * high - low], strict=False)]
+    return bool(pairs) and all(above == below + 2 and below + 1 not in mesh.nodes for below, above in pairs)
+
+
+def _no_solids(deck: Path) -> set[int] | None:
+    """Numbers of the elements of a deck that are no solids; None without a deck."""
+    if not deck.is_file():
+        return None
+    solids, others = set[int](), set[int]()
+    for keyword in keywords(deck):
+        if keyword.name == "ELEMENT":
+            of = solids if keyword.options.get("TYPE", "").upper().startswith("C3D") else others
+            of.update(int(row[0]) for row in keyword.rows if row[0].isdecimal())
+    return others - solids

@@ -15,7 +15,7 @@ import numpy as np
 
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import ImageFileError
-from dvc.io.meshes.raw import RawMesh, damage_named
+from dvc.io.meshes.raw import RawMesh, damage_named, finite
 
 _log = logging.getLogger("dvc.io.meshes.febio")
 
@@ -153,7 +153,7 @@ def time_reached(path: Path) -> float | None:
     with damage_named(f"{path}: its sections"):
         last = deque((body for tag, body in _sections(path.read_bytes()) if tag == _STATE), maxlen=1)
         time = _at(last[0], *_TIME) if last else b""
-        return float(np.float32(struct.unpack("<f", time)[0])) if time else None
+        return finite(float(np.float32(struct.unpack("<f", time)[0]))) if time else None
 
 
 def _tell_iterations(path: Path, before: bytes, state: bytes) -> None:

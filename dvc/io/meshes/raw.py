@@ -1,6 +1,7 @@
 """A mesh as its file gives it, before unit, frame and geometry are checked: what every reader returns."""
 
 import logging
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -132,6 +133,13 @@ def read_text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise ImageFileError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def finite(number: float) -> float:
+    """The number unchanged; ValueError if it is NaN or infinite."""
+    if not math.isfinite(number):
+        raise ValueError(f"{number} is no number that a result can have")
+    return number
 
 
 @contextmanager
