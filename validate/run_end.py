@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-from dvc.io.meshes.calculix import time_reached as time_in_frd
+from dvc.io.meshes.calculix import is_closed, time_reached as time_in_frd
 from dvc.io.meshes.febio import time_reached as time_in_xplt
 
 _BANNER = "F O R   B I O M E C H A N I C S"  # of every log of FEBio
@@ -23,8 +23,8 @@ def early_end(place: Path) -> EarlyEnd | None:
     """Why the run that wrote a result (.xplt, .frd) may have ended early; None where nothing says so.
 
     FEBio says in its log how a run ended. Without a log, and for CalculiX, the time of the last state is compared with
-    the time of all steps in the deck. These files lie beside the result and have its name. ImageFileError for a damaged
-    result.
+    the time of all steps in the deck. These files lie beside the result and have its name. Without a deck, CalculiX'
+    result must have its last line. ImageFileError for a damaged result.
     """
     kind = place.suffix.lower()
     if kind == ".xplt":
@@ -39,7 +39,11 @@ def early_end(place: Path) -> EarlyEnd | None:
             return EarlyEnd(f"has no end in its log ({place.stem}.log) and stopped{at}", certain=True)
         return _compared(time, whole, f"{place.stem}.feb")
     if kind == ".frd":
-        return _compared(time_in_frd(place), _calculix_time(place.with_suffix(".inp")), f"{place.stem}.inp")
+        time, whole = time_in_frd(place), _calculix_time(place.with_suffix(".inp"))
+        if whole is None and time is not None and not is_closed(place):
+            reason = f"has no end in its result (the line 9999) and stopped at time {time:g}"
+            return EarlyEnd(reason, certain=True)
+        return _compared(time, whole, f"{place.stem}.inp")
     return None
 
 

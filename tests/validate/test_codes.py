@@ -177,7 +177,7 @@ def test_rigid_parts_are_those_that_moved(digits: int | None) -> None:
     ],
 )
 def test_the_time_of_a_deck(folder: Path, tmp_path: Path, steps: str, early: bool | None) -> None:
-    (tmp_path / "Load1.frd").write_bytes((folder / "calculix/incs.frd").read_bytes())  # to time 0.4
+    (tmp_path / "Load1.frd").write_bytes((folder / "calculix/incs.frd").read_bytes() + b" 9999\n")  # to time 0.4
     (tmp_path / "Load1.inp").write_text(f"*STEP\n{steps}*END STEP\n")
     end = early_end(tmp_path / "Load1.frd")
     assert (end is not None) == (early is not False)
@@ -207,13 +207,19 @@ def test_a_time_that_is_no_number_is_refused(folder: Path, tmp_path: Path) -> No
         early_end(tmp_path / "Load1.xplt")
 
 
-def test_without_log_and_deck_a_time_that_is_not_whole_is_doubted(folder: Path, tmp_path: Path) -> None:
+def test_without_log_and_deck_a_time_that_is_not_whole_or_a_file_without_its_end_is_doubted(
+    folder: Path, tmp_path: Path
+) -> None:
     for name in ("febio/fails.xplt", "calculix/incs.frd", "febio/tet4.xplt", "calculix/c3d4.frd"):
         alone = tmp_path / Path(name).name
         alone.write_bytes((folder / name).read_bytes())
         end = early_end(alone)
         assert (end is not None) == (name in EARLY)
-        assert end is None or not end.certain
+        assert end is None or end.certain == name.endswith(".frd")  # which lacks its last line
+    text = (folder / "calculix/c3d4.frd").read_text()
+    (tmp_path / "Load1.frd").write_text(text.removesuffix(" 9999\n"))
+    end = early_end(tmp_path / "Load1.frd")
+    assert end == ("has no end in its result (the line 9999) and stopped at time 1", True)
     cut = tmp_path / "tet4.xplt"
     cut.with_suffix(".log").write_text("F O R   B I O M E C H A N I C S\n===== beginning time step 5 : 1 =====\n")
     end = early_end(cut)

@@ -67,6 +67,13 @@ def time_reached(path: Path) -> float | None:
     return max(times, default=None)
 
 
+def is_closed(path: Path) -> bool:
+    """Whether the file has its last line, 9999: CalculiX writes it when a run ends, and not when it fails."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 200))
+        return file.read().rstrip().rpartition(b"\n")[2].strip() == b"9999"
+
+
 def _rows(path: Path, lines: Iterator[tuple[int, str]], block: str) -> list[str]:
     """Lines of a block to its end."""
     rows: list[str] = []
