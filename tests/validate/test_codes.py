@@ -194,6 +194,14 @@ def test_a_run_that_failed_before_its_first_state_has_no_time(folder: Path, tmp_
     assert early_end(tmp_path / "Load1.xplt") == ("ended with ERROR TERMINATION (Load1.log)", True)
 
 
+def test_an_element_that_is_lost_from_a_calculix_result_is_missed(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "calculix/spring.frd").read_text()
+    start, end = text.index(" -1", text.index("    3C")), text.index(" -1         2   11")
+    (tmp_path / "Load1.frd").write_text(text[:start] + text[end:])
+    with pytest.raises(ImageFileError, match=r"Load1\.frd, after line .* \(1 of 2 items\)"):
+        read_mesh(tmp_path / "Load1.frd")
+
+
 def test_a_time_that_is_no_number_is_refused(folder: Path, tmp_path: Path) -> None:
     text = (folder / "calculix/c3d4.frd").read_text()
     (tmp_path / "Load1.frd").write_text(text.replace("105 1.000000000", "105         inf"))

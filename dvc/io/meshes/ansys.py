@@ -57,9 +57,9 @@ def read_ansys(path: Path) -> RawMesh:
                     number, kind = _columns(row, width, 2)
                     types[str(number)] = str(kind)
             elif word == "NBLOCK":
-                _add_nodes(lines, mesh)
+                _tell_count(path, fields, _add_nodes(lines, mesh))
             elif word == "EBLOCK" and len(fields) > 2 and fields[2].upper() == "SOLID":
-                _add_elements(lines, types, mesh, materials)
+                _tell_count(path, fields, _add_elements(lines, types, mesh, materials))
             elif word == "EBLOCK":
                 _log.warning("%s: a block of contact elements is skipped.", path)
                 mesh.left_out = True
@@ -88,9 +88,16 @@ def _columns(line: str, width: int, count: int | None = None) -> list[int]:
     return [int(line[i * width : (i + 1) * width]) for i in range(columns)]
 
 
-def _add_nodes(lines: Iterator[str], mesh: NumberedMesh) -> None:
+def _tell_count(path: Path, fields: list[str], found: int) -> None:
+    """Warn of a block that has not as many rows as its head says, in its last field, where it does say."""
+    if len(fields) > 4 and fields[4] not in ("", "0", str(found)):
+        _log.warning("%s: %s should have %s rows and has %d; some may be lost.", path, fields[0], fields[4], found)
+
+
+def _add_nodes(lines: Iterator[str], mesh: NumberedMesh) -> int:
+    """Add the nodes of a block to the mesh, and give their number."""
     count, width, _, wide = _format(_next(lines, "NBLOCK"))
-    start = count * width
+    start, found = count * width, 0
     # The end is written in one way in old archives and in another in new ones.
     while not (line := _next(lines, "NBLOCK")).lstrip().startswith(("N,", "-1")):
         # Trailing zeros are left out, so a row may hold fewer than three coordinates.
@@ -99,13 +106,17 @@ def _add_nodes(lines: Iterator[str], mesh: NumberedMesh) -> None:
         if cut:
             raise ValueError(f"'{cut[0]}' is not a coordinate")
         mesh.add_node(int(line[:width]), [float(text or 0.0) for text in at])
+        found += 1
+    return found
 
 
-def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMesh, of: dict[int, list[int]]) -> None:
-    """Add the elements of a block to the mesh, and their numbers to those ``of`` their materials."""
+def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMesh, of: dict[int, list[int]]) -> int:
+    """Add the elements of a block to the mesh, and their numbers to those ``of`` their materials; give their number."""
     _, width, *_ = _format(_next(lines, "EBLOCK"))
     left_out: Counter[str] = Counter()
+    found = 0
     while (line := _next(lines, "EBLOCK")).strip() != "-1":
+        found += 1
         numbers = _columns(line, width)
         material, kind, number, count = numbers[0], str(numbers[1]), numbers[10], numbers[8]
         nodes = numbers[_HEAD:]
@@ -122,6 +133,7 @@ def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMes
             of.setdefault(material, []).append(number)
     for kind, count in left_out.items():
         _log.warning("%s: %d elements of type %s are skipped: not a supported solid or shell.", mesh.path, count, kind)
+    return found
 
 
 def _members(lines: Iterator[str], count: int) -> Members:

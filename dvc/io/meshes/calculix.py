@@ -24,6 +24,7 @@ _ORDER = {
 # Where a solid's lower and its upper nodes begin, of those between which a shell that was expanded has none.
 _LAYERS = {"hexahedron": (0, 4), "wedge": (0, 3), "hexahedron20": (8, 12), "wedge15": (6, 9)}
 _NODE, _VALUE = 10, 12  # columns of a number of a node, and of a value
+_COUNT = slice(6, 36)  # of the head of nodes or elements
 _TIME, _ANALYSIS, _IN_TIME = slice(12, 24), slice(56, 58), (0, 1)  # of the head of results; static and transient
 
 
@@ -47,10 +48,11 @@ def read_frd(path: Path) -> RawMesh:
     for number, line in lines:
         with damage_named(f"{path}, after line {number}: a row"):
             if line.startswith("    2C"):
-                for row in _rows(path, lines, "nodes"):
+                for row in _counted(line, _rows(path, lines, "nodes")):
                     mesh.add_node(int(row[3:13]), _values(row))
             elif line.startswith("    3C"):
-                _add_elements(_rows(path, lines, "elements"), mesh, materials, _no_solids(path.with_suffix(".inp")))
+                rows = _counted(line, _rows(path, lines, "elements"))
+                _add_elements(rows, mesh, materials, _no_solids(path.with_suffix(".inp")))
             elif line.startswith(" -4  DISP"):
                 rows = [row for row in _rows(path, lines, "displacements") if row.startswith(" -1")]
                 at_nodes = {"displacement": {int(row[3:13]): _values(row) for row in rows}}
@@ -82,6 +84,14 @@ def _rows(path: Path, lines: Iterator[tuple[int, str]], block: str) -> list[str]
             return rows
         rows.append(line)
     raise ImageFileError(f"{path}: the file is incomplete; it ends within the {block}.")
+
+
+def _counted(head: str, rows: list[str]) -> list[str]:
+    """The rows unchanged; ValueError if they are not of as many items as the head of their block says."""
+    found = sum(row.startswith(" -1") for row in rows)
+    if found != int(head[_COUNT]):
+        raise ValueError(f"{found} of {int(head[_COUNT])} items")
+    return rows
 
 
 def _values(row: str) -> list[float]:

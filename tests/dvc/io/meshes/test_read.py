@@ -246,10 +246,15 @@ def test_an_ansys_archive_that_may_be_cut_after_a_block_is_told(
 ) -> None:
     path = written(tmp_path, "cdb")
     read_mesh(path)
-    assert "FINISH" not in caplog.text
+    assert not caplog.text
     path.write_text(path.read_text().partition("/GO")[0])
     read_mesh(path)
     assert "heel.cdb does not end in FINISH" in caplog.text
+    lines = written(tmp_path, "cdb").read_text().splitlines(keepends=True)
+    del lines[next(n for n, line in enumerate(lines) if line.startswith(row(2, 1, 1, 1))) + 1]
+    path.write_text("".join(lines))
+    assert read_mesh(path).cell_count == 49
+    assert "heel.cdb: EBLOCK should have 50 rows and has 49" in caplog.text
 
 
 @pytest.mark.parametrize(
