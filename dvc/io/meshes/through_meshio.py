@@ -6,6 +6,7 @@ reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node orde
 
 import io
 import logging
+import math
 import re
 import tempfile
 import warnings
@@ -37,6 +38,7 @@ _MOST_REGIONS = 256
 _MOST_STEPS = 1_000_000  # a number alone on a line may be that of a time step, in a small file too
 _HIGHEST_NUMBER = 100_000_000  # meshio keeps an array of so many
 _GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"?(.*?)"?[ \t]*\r?$', re.MULTILINE)
+_GRID = re.compile(rb"^DIMENSIONS[ \t]+(\d{1,18})[ \t]+(\d{1,18})[ \t]+(\d{1,18})", re.MULTILINE | re.IGNORECASE)
 # Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
 _TO_VTK = {
     "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
@@ -189,7 +191,11 @@ def _start(data: bytes, name: bytes) -> int:
 
 def read_vtk(path: Path) -> RawMesh:
     """Read a .vtu or .vtk file; its nodes have no numbers and are counted from 0."""
-    mesh = _read(path, meshio.vtu.read if path.suffix.lower() == ".vtu" else meshio.vtk.read)
+    if path.suffix.lower() == ".vtu":
+        mesh = _read(path, meshio.vtu.read)
+    else:
+        _refuse_a_grid_too_large(path)
+        mesh = _read(path, meshio.vtk.read)
     regions: dict[str, IntArray] = {}
     arrays = {name.casefold(): name for name in mesh.cell_data}
     for wanted in _REGION_ARRAYS:
@@ -202,6 +208,14 @@ def read_vtk(path: Path) -> RawMesh:
                 break
     blocks = [(block.type, block.data) for block in mesh.cells]
     return RawMesh(path, mesh.points, np.arange(len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
+
+
+def _refuse_a_grid_too_large(path: Path) -> None:
+    """Refuse a regular grid of more points than the file can have values of: meshio makes them all."""
+    grid = _GRID.search(path.read_bytes())
+    if grid and math.prod(map(int, grid.groups())) > path.stat().st_size:
+        size = " x ".join(number.decode() for number in grid.groups())
+        raise ImageFileError(f"{path}: the file is too short for a grid of {size} points. It is damaged or incomplete.")
 
 
 def _read(path: Path, read: Callable[[str], Any]) -> Any:

@@ -282,6 +282,19 @@ def test_counts_that_a_mesh_file_cannot_hold_are_refused_at_once(
         read_mesh(path)
 
 
+def test_a_grid_of_more_points_than_its_file_can_hold_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "heel.vtk"
+    head = "# vtk DataFile Version 3.0\na heel\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS {}\nORIGIN 0 0 0\n"
+    text = head + "SPACING 5 5 5\nPOINT_DATA 8\nSCALARS u double 1\nLOOKUP_TABLE default\n1 2 3 4 5 6 7 8\n"
+    path.write_text(text.format("2 2 2"))
+    assert [(block.kind, len(block.nodes)) for block in read_mesh(path).blocks] == [("hexahedron", 1)]
+    path.write_text(text.format("2 2 2999999999"))
+    with pytest.raises(
+        ImageFileError, match=r"heel\.vtk: the file is too short for a grid of 2 x 2 x 2999999999 points"
+    ):
+        read_mesh(path)
+
+
 def test_the_name_of_a_gmsh_group_may_lack_its_quotes(tmp_path: Path) -> None:
     path = written(tmp_path, "msh-41")
     path.write_text(path.read_text().replace('"sole"', "sole"))
