@@ -14,12 +14,13 @@ from types import MappingProxyType
 
 from dvc.errors import InputError
 from fe.hyperelastic import OGDEN
-from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
+from fe.materials import MODES, Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 
 WHOLE = "all"
 """Name of the tissue in a set that has one constitutive model for all tissues."""
 
-_FAR = 10.0  # times the range of the published sets
+_FAR, _ODD = 10.0, 1000.0  # times the range of the published sets: for their tissues, and for any other
+_USED = 0.7, 1.4  # stretches of tissue under a plate
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
@@ -51,8 +52,9 @@ class MaterialSet:
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
         """The material of each region of a mesh, and sentences on what a person should know of that choice.
 
-        That is each region that gets the material of another tissue, and each tissue that is over ten times as stiff,
-        or as soft, as in any published set: its parameters may be in another unit.
+        That is each region that gets the material of another tissue; each tissue that is over ten times as stiff, or as
+        soft, as in any published set, because its parameters may be in another unit; and each material that is not
+        stable at stretches of 0.7 to 1.4, where its stress falls.
 
         Tendon and aponeurosis without a material get that of muscle, or else of fat; muscle gets that of fat. No other
         substitution is made.
@@ -71,7 +73,7 @@ class MaterialSet:
         by_region, notes = dict[str, Material](), list[str]()
         if WHOLE in self.materials:
             by_region = dict.fromkeys(regions, self.materials[WHOLE])
-            return by_region, tuple(_odd_stiffness(self.name, by_region))
+            return by_region, tuple(_odd(self.name, by_region))
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
@@ -86,7 +88,28 @@ class MaterialSet:
             by_region[region] = known[name.casefold()]
             if name != region:
                 notes.append(f"{self.name} has no material for {region}; that of {name} is used.")
-        return by_region, (*notes, *_odd_stiffness(self.name, by_region))
+        return by_region, (*notes, *_odd(self.name, by_region))
+
+
+def _odd(name: str, materials: Materials) -> list[str]:
+    """Sentences on materials whose stiffness is odd, and on those whose stress falls at strains of use."""
+    return [*_odd_stiffness(name, materials), *_falling(name, materials)]
+
+
+def _falling(name: str, materials: Materials) -> list[str]:
+    """A sentence for each tissue whose material is not stable at stretches of use, with the narrowest of its ranges."""
+    found = []
+    for tissue, law in materials.items():
+        ranges = {mode: law.stable_range(mode) for mode in MODES}
+        mode = min(ranges, key=lambda mode: ranges[mode][1] / ranges[mode][0])
+        low, high = ranges[mode]
+        if low > _USED[0] or high < _USED[1]:
+            found.append(
+                f"{name}: the material of {tissue} softens until its stress falls: it is stable only at {mode} "
+                f"stretches of {low:.2f} to {high:.2f}, and tissue under a plate is stretched by {_USED[0]:g} to "
+                f"{_USED[1]:g}. Check the signs of its parameters."
+            )
+    return found
 
 
 def _odd_stiffness(name: str, materials: Materials) -> list[str]:
@@ -100,9 +123,10 @@ def _odd_stiffness(name: str, materials: Materials) -> list[str]:
         known = [laws[0].shear_modulus_mpa for laws in of_sets if laws]
         low, high = min(known), max(known)
         is_named = any(tissue.casefold() in one.materials for one in _published().values())
-        if not is_named or low / _FAR <= own <= high * _FAR:
+        times = _FAR if is_named else _ODD
+        if low / times <= own and (own <= high * times or not is_named):  # tissues of no set may be as stiff as bone
             continue
-        far = f"over ten times as {'stiff' if own > high else 'soft'} as in any published set"
+        far = f"over {times:g} times as {'stiff' if own > high else 'soft'} as in any published set"
         units = {1e-3: " Are its parameters in kPa, entered as MPa?", 1e3: " Are they in MPa, entered as kPa?"}
         unit = next((asks for times, asks in units.items() if low / _FAR <= own * times <= high * _FAR), "")
         found.append(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dvc.errors import InputError
-from fe import MaterialSet, NeoHooke, Ogden, material_set, published_names, read_material_sets
+from fe import Material, MaterialSet, NeoHooke, Ogden, Yeoh, material_set, published_names, read_material_sets
 
 # Initial shear modulus (kPa) and Poisson's ratio by hand from the printed numbers.
 PRINTED = {
@@ -43,6 +43,24 @@ def test_a_stiffness_in_another_unit_is_told() -> None:
     assert note.endswith("in MPa, entered as kPa?")
     for name in published_names():
         assert not [note for note in material_set(name).for_regions(["fat", "muscle", "skin"])[1] if "modulus" in note]
+
+    (note,) = MaterialSet("mine", "", "", {"foam": NeoHooke.of(1e-8)}).for_regions(["foam"])[1]
+    assert note.startswith("mine: foam has a shear modulus of 1e-05 kPa, which is over 1000 times as soft")
+
+
+@pytest.mark.parametrize(
+    ("law", "range_told"),
+    [
+        (Yeoh.of(0.265, -0.1), "equibiaxial stretches of 0.83 to 1.22"),
+        (Ogden.of([0.02, -0.01], [2.0, 10.0]), "equibiaxial stretches of 0.95 to 1.09"),
+        (Yeoh.of(0.005, -0.01, 0.05), ""),
+        (Yeoh.of(0.005, -0.0004), ""),
+    ],
+)
+def test_a_law_whose_stress_falls_at_strains_of_use_is_told(law: Material, range_told: str) -> None:
+    notes = MaterialSet("mine", "", "", {"foam": law}).for_regions(["foam"])[1]
+    assert len(notes) == bool(range_told)
+    assert all(f"foam softens until its stress falls: it is stable only at {range_told}" in note for note in notes)
 
 
 def test_every_published_law_has_the_printed_modulus() -> None:
