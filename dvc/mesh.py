@@ -135,6 +135,19 @@ def faces_of(cells: IntArray) -> IntArray:
     return np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
 
 
+def repeated_rows(rows: FloatArray | IntArray) -> IntArray:
+    """Indices, rising, of the rows of (n, k) that are equal to an earlier row.
+
+    Examples
+    --------
+    >>> repeated_rows(np.array([[1, 2], [3, 4], [1, 2]])).tolist()
+    [2]
+    """
+    order = np.lexsort(rows.T)
+    same = (rows[order[1:]] == rows[order[:-1]]).all(axis=1)
+    return np.asarray(np.sort(order[1:][same]))
+
+
 def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
     """Nodes (n, 3); InputError for another shape, GeometryError for a coordinate that is not finite."""
     try:

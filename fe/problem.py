@@ -13,10 +13,16 @@ from dvc import TetMesh
 from dvc.arguments import check_fields, checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
+from dvc.mesh import repeated_rows
 from fe.elements import element as formulation
 from fe.materials import Materials
 from fe.mesh_file import BONE, SKIN
 from fe.plate import Contact, Plate
+
+_MOST_STIFFNESSES = 1000.0  # largest pressure, in shear moduli: free neo-Hookean tissue keeps 3 % of its thickness
+_UNUSUAL_MPA = 1.0  # peak pressure under the heel of a runner
+_MM2_PER_CM2 = 100.0
+_NAMED = 3  # so many repeated cells are named
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,8 +150,8 @@ class Problem:
     ------
     InputError
         If an argument has the wrong type, such as a file path in place of a mesh; if a region has no material, a cell
-        has no region, or a surface set is missing; if tissue is not connected to a fixed surface; if the plate comes
-        from the wrong side; or if a load cannot be applied by the plate.
+        has no region or is there twice, or a surface set is missing; if tissue is not connected to a fixed surface; if
+        the plate comes from the wrong side; or if a load cannot be applied by the plate, or borne by any tissue.
     """
 
     mesh: TetMesh
@@ -175,6 +181,12 @@ class Problem:
         if not len(on_surface):
             raise InputError(f"All nodes of '{SKIN}' are fixed ({', '.join(fixed)}), so the plate cannot deform it.")
         Contact(self.plate, mesh.points_mm @ self.plate.axes, on_surface)
+        _ = self.notes
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on loads that are unusual for tissue; InputError for those that no tissue can bear."""
+        return tuple(note for load in self.loads if (note := _unusual(self.mesh, self.materials, self.plate, load)))
 
 
 @checked
@@ -215,9 +227,56 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
             raise InputError(f"{load.name}: a plate without friction cannot apply shear; got {load}.")
 
 
+def _unusual(mesh: TetMesh, materials: Materials, plate: Plate, load: LoadStep) -> str:
+    """A sentence on a load of over 1 MPa on all of the skin, or that moves the plate past the bone; else nothing.
+
+    InputError if the pressure is over 1000 times the shear modulus of the stiffest tissue, or the plate would move by
+    more than the size of the body. The true pressure is higher, because the plate touches only a part of the skin.
+    """
+    points = mesh.points_mm @ plate.axes
+    faces, size_mm = points[mesh.facets[SKIN]], float(np.ptp(points, axis=0).max())
+    area_mm2 = 0.5 * float(np.abs(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])[:, 0]).sum())
+    stiffest_mpa = max(material.shear_modulus_mpa for material in materials.values())
+    force_n = max(abs(load.normal_n or 0.0), abs(load.shear_n or 0.0))
+    pressure_mpa = force_n / max(area_mm2, 1e-9)
+    told = (
+        f"The force of {load.name}, {force_n:g} N, is a pressure of {pressure_mpa:.3g} MPa on all of the skin "
+        f"({area_mm2 / _MM2_PER_CM2:.3g} cm2)"
+    )
+    if pressure_mpa > _MOST_STIFFNESSES * stiffest_mpa:
+        raise InputError(
+            f"{told}, over {_MOST_STIFFNESSES:g} times the shear modulus of the stiffest tissue ({stiffest_mpa:.3g} "
+            "MPa): no tissue bears it. Forces are in N and moduli in MPa; check both."
+        )
+    inward_mm, along_mm = (load.normal_mm or 0.0) - plate.gap_mm, abs(load.shear_mm or 0.0)
+    if max(inward_mm, along_mm) > size_mm:
+        raise InputError(
+            f"{load.name}: the plate would move by more than the size of the body ({size_mm:.3g} mm); got {load}. "
+            "Displacements are in mm."
+        )
+    if pressure_mpa > _UNUSUAL_MPA:
+        in_mn = " Is it in mN?" if pressure_mpa <= 1e3 * _UNUSUAL_MPA else ""
+        return f"{told}; under a runner's heel it is about {_UNUSUAL_MPA:g} MPa. Forces are in N.{in_mn}"
+    bone = np.setdiff1d(mesh.facets.get(BONE, np.empty(0, dtype=np.int64)), mesh.facets[SKIN])
+    bone_mm = float(points[bone, 0].min(initial=np.inf) - faces[..., 0].min())
+    if inward_mm > bone_mm:
+        return (
+            f"Under {load.name} the plate would move by {inward_mm:.3g} mm into the tissue, past the bone, which lies "
+            f"{bone_mm:.3g} mm from the skin that it touches first."
+        )
+    return ""
+
+
 @checked
 def check_materials(mesh: TetMesh, materials: Materials) -> None:
-    """InputError unless every cell of a mesh has exactly one material."""
+    """InputError unless a mesh has every cell only once, and every cell has exactly one material."""
+    if len(again := repeated_rows(np.sort(mesh.cells, axis=1))):
+        first = ", ".join(map(str, again[:_NAMED])) + (" ..." if len(again) > _NAMED else "")
+        raise InputError(
+            f"{len(again)} of {len(mesh.cells)} cells are repeated: others have the same four nodes, so their "
+            f"stiffness would count twice. They are cells {first} (from 0). Remove them in the program that made the "
+            "mesh."
+        )
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
         if region not in mesh.regions:

@@ -77,6 +77,7 @@ class Simulation:
         """The simulation of these problems, one for each path, with the final states of their loads."""
         first = problems[0]
         by_region, remarks = materials.for_regions(first.mesh.regions)
+        remarks += tuple(note for one in problems for note in one.notes)
         return cls(
             replace(materials, materials=by_region), first.mesh, tuple(tuple(one.loads) for one in problems),
             tuple(states), tuple(first.fixed), first.element, first.plate.turns, remarks,
@@ -129,6 +130,13 @@ class Simulation:
                 when = began if len(state.curve) > 1 else "before the first equilibrium"
                 notes.append(f"{state.load.name}: the time limit was reached {when}.")
         notes += [
+            f"{state.load.name}: no equilibrium was found beyond {state.reached:.0%} of the load, in the least steps; "
+            f"{'cells were about to fold' if (least := self._least_volume(state)) < CROWDED else 'the tissue yielded'} "
+            f"(least det F {least:.2f}). Lower the load, or check its unit and the material parameters."
+            for state in self.states
+            if state.reached < 1.0 and not state.out_of_time
+        ]
+        notes += [
             f"{load.name} was not tried: the previous load was not reached."
             for load in self.loads
             if load.name not in reached
@@ -143,6 +151,9 @@ class Simulation:
 
     def _rows(self, state: LoadState) -> list[RegionFigures]:
         return [row for row in self.regions if row.load == state.load.name]
+
+    def _least_volume(self, state: LoadState) -> float:
+        return float(state.strain.jacobian.min())
 
     def _share_off(self, state: LoadState) -> float:
         return result.volume_share_off(self.mesh, state, self.materials.materials)
@@ -380,5 +391,8 @@ def simulate(
     below 1, and `Simulation.complete` is False.
     """
     chosen = as_material_set(materials)
-    problems = problems_of(mesh, chosen.for_regions(mesh.regions)[0], plate, loads, fixed, element)
+    (by_region, notes), observer = chosen.for_regions(mesh.regions), observer or Observer()
+    problems = problems_of(mesh, by_region, plate, loads, fixed, element)
+    for note in (*notes, *(note for one in problems for note in one.notes)):
+        observer.log(note)
     return Simulation.of(chosen, problems, [s for one in problems for s in solve(one, options, observer)])

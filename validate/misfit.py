@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from dvc import LabelMap, TetMesh
 from dvc.arguments import checked
 from dvc.errors import GeometryError, InputError
-from dvc.mesh import box_told
+from dvc.mesh import box_told, repeated_rows
 from dvc.worker import Each
 from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
@@ -20,6 +20,7 @@ from validate.mapping import MappedFields, check_bones, tissues_of
 _LEAST_OVERLAP, _GOOD_OVERLAP, _SAME_TISSUE, _VOLUME_CHANGE = 0.85, 0.95, 0.8, 0.15
 _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
 _ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
+_SAME_PLACE_MM = 1e-6
 
 
 @checked
@@ -84,11 +85,16 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
 def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
     """Check a model against the label map; returns a sentence for each possible input error.
 
-    Reported are models of which less than 95 % lies in the labelled soft tissue, whose tissue names agree with the
-    label map in under 80 % of the volume, that move by over 1 mm at the bone, or whose mean change of cell volume is
-    over 15 %. Errors as `check_in_tissue`.
+    Reported are models with cells that are there twice, of which less than 95 % lies in the labelled soft tissue, whose
+    tissue names agree with the label map in under 80 % of the volume, that move by over 1 mm at the bone, or whose mean
+    change of cell volume is over 15 %. Errors as `check_in_tissue`.
     """
     mesh, warnings = result.mesh, []
+    if len(again := repeated_rows(np.round(mesh.centroids_mm / _SAME_PLACE_MM))):
+        warnings.append(
+            f"{len(again)} of its {len(mesh.cells)} tetrahedra are repeated (the first is number {again[0]}, from 0), "
+            "so their volume counts twice; remove them from the model."
+        )
     overlap = check_in_tissue(result.path, mesh, labels, bones)
     if overlap < _GOOD_OVERLAP:
         warnings.append(f"only {overlap:.0%} of the model lies in the labelled soft tissue; check its frame.")

@@ -95,13 +95,14 @@ def simulate(
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
     plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}
     held = fe.fixed_facets(read, simulation.fixed)
-    for note in (note for one in chosen for note in one.for_regions(read.regions)[1]):
-        tell(NOTE, note, 0.0)
     jobs = [
         (one, problem)
         for one in chosen
         for problem in fe.problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, simulation.element)
     ]
+    notes = [note for one in chosen for note in one.for_regions(read.regions)[1]]
+    for note in dict.fromkeys([*notes, *(note for _, problem in jobs for note in problem.notes)]):
+        tell(NOTE, note, 0.0)
     refuse_touching_inputs(target, [one.name for one in chosen], [place])
     make_output(target)
     for folder in (target / one.name for one in chosen):

@@ -1,6 +1,7 @@
 """A plate pressed and sheared against a dome of tissue on fixed bone: balance, tape, symmetry, frame, refusals."""
 
 import itertools
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
-from fe import LoadState, LoadStep, NeoHooke, Ogden, Plate, Tolerance, cauchy_stress, region_figures
+from fe import LoadState, LoadStep, NeoHooke, Ogden, Plate, Problem, Tolerance, cauchy_stress, region_figures
 from tests.blocks import block
 from tests.fe.solving import Notebook, solved
 from tests.fe.test_assembly import needs_ngsolve
@@ -309,6 +310,14 @@ def test_a_plate_without_friction_carries_no_shear() -> None:
         ({"facets": {"skin": None}}, "no surface set 'bone'"),
         ({"element": "P3"}, "Unknown element 'P3'"),
         ({"normal": [1.0, 0, 0], "shear": [1.0, 0, 0]}, "parallel"),
+        (
+            {"loads": [LoadStep("kN", 1e9)]},
+            r"kN, 1e\+09 N, is a pressure of 2.5e\+06 MPa on all of the skin \(4 cm2\), over 1000 times the shear",
+        ),
+        ({"loads": [LoadStep("slid", 2.0, -1e9)]}, r"slid, 1e\+09 N, is a pressure of"),
+        ({"laws": dict.fromkeys(LAWS, NeoHooke.of(1e-8))}, r"stiffest tissue \(1e-08 MPa\): no tissue bears it"),
+        ({"loads": [LoadStep("far", normal_mm=95.0)]}, r"far: the plate would move by more than the size of the body"),
+        ({"loads": [LoadStep("far", 2.0, shear_mm=-95.0)]}, r"than the size of the body \(20 mm\)"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused(change: dict, said: str) -> None:
@@ -319,6 +328,31 @@ def test_what_cannot_be_simulated_is_refused(change: dict, said: str) -> None:
     loads, laws = change.pop("loads", PRESS), change.pop("laws", LAWS)
     with pytest.raises(InputError, match=said):
         press(mesh, loads, laws, **change)
+
+
+@pytest.mark.parametrize(
+    ("load", "gap_mm", "said"),
+    [
+        (LoadStep("a", 300.0), 0.0, ""),  # 0.75 MPa
+        (LoadStep("a", 800.0), 0.0, "800 N, is a pressure of 2 MPa .* runner's heel .* Is it in mN"),
+        (LoadStep("a", 2.0, -800.0), 0.0, "800 N, is a pressure of 2 MPa"),
+        (LoadStep("a", normal_mm=9.9), 0.0, ""),
+        (LoadStep("a", normal_mm=12.0), 3.0, ""),
+        (LoadStep("a", normal_mm=12.0), 0.0, "Under a the plate would move by 12 mm .* past the bone, .* 10 mm"),
+    ],
+)
+def test_a_load_that_is_unusual_for_tissue_is_told(load: LoadStep, gap_mm: float, said: str) -> None:
+    notes = Problem(dome((2, 2, 2)), LAWS, Plate(DOWN, ALONG, gap_mm=gap_mm), [load]).notes
+    assert [bool(re.search(said, note)) for note in notes] == [True] * bool(said)
+
+
+def test_cells_that_are_there_twice_are_refused() -> None:
+    mesh = dome((2, 2, 2))
+    again = mesh.cells[[7, 3, 3, 20, 9]][:, [2, 0, 1, 3]]  # in another order
+    fat = np.append(mesh.regions["fat"], len(mesh.cells) + np.arange(5))
+    twice = TetMesh(mesh.points_mm, np.concatenate([mesh.cells, again]), dict(mesh.regions) | {"fat": fat}, mesh.facets)
+    with pytest.raises(InputError, match=r"5 of 53 cells are repeated.* They are cells 48, 49, 50 \.\.\. \(from 0\)"):
+        press(twice, PRESS)
 
 
 def test_the_plate_travels_its_gap_first(sheared: list[LoadState]) -> None:

@@ -14,6 +14,7 @@ from matplotlib.image import imread
 import fe
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError
+from tests.fe.solving import Notebook
 from tests.fe.test_simulate import ALONG, DOWN, FAT, LAWS, dome
 
 LOADS = [fe.LoadStep("pressed", 2.0), fe.LoadStep("sheared", 2.0, 1.0), fe.LoadStep("in", normal_mm=1.0)]
@@ -82,6 +83,16 @@ def test_it_comes_back_from_its_folder_as_it_was(simulation: fe.Simulation, tmp_
     )
     assert curve == pytest.approx(was, rel=1e-7, abs=1e-12, nan_ok=True)
     assert str(read) == str(simulation)
+
+
+def test_what_is_odd_is_told_before_anything_is_solved_and_noted() -> None:
+    heard = Notebook()
+    loads, odd = [fe.LoadStep("a", 500.0)], {"skin": fe.NeoHooke.of(0.2), "fat": fe.Yeoh.of(0.005, -0.005)}
+    given = dome((2, 2, 2)), odd, fe.Plate(DOWN, ALONG), loads
+    done = fe.simulate(*given, options=fe.SolverOptions(limit_s=0.0), observer=heard)
+    assert "fat softens until its stress falls" in heard.lines[0]
+    assert heard.lines[1].startswith("The force of a, 500 N, is a pressure of 1.25 MPa")
+    assert done.notes[:2] == tuple(heard.lines[:2])
 
 
 def test_what_was_not_reached_comes_back_and_is_marked_everywhere(unreached: fe.Simulation, tmp_path: Path) -> None:

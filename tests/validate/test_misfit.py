@@ -10,6 +10,7 @@ import pytest
 
 from dvc.errors import ExtentError, GeometryError
 from dvc.images.image import Grid
+from dvc.mesh import TetMesh
 from mrstrain.comparison.model_files import ModelFile
 from mrstrain.options.modelling import ModelReading
 from tests.validate.test_comparison import SIDE, cube, labels, result, sheared
@@ -90,3 +91,13 @@ def test_refusals_show_both_boxes(tmp_path) -> None:
     with pytest.raises(ExtentError, match=r"too large for a body part.*spans 5000 to 15000") as told:
         file.read(grid)
     assert str(file.path) in str(told.value)
+
+
+def test_cells_that_are_there_twice_are_told() -> None:
+    mesh = cube(4)
+    assert not misfits(result("once", mesh, sheared(0.1)), labels(), ["bone"])
+    twice = TetMesh(mesh.points_mm, np.concatenate([mesh.cells, mesh.cells[5:10]]), mesh.regions, mesh.facets)
+    (note,) = misfits(result("twice", twice, sheared(0.1)), labels(), ["bone"])
+    assert note.startswith(
+        f"twice: 5 of its {len(twice.cells)} tetrahedra are repeated (the first is number {len(mesh.cells)}"
+    )

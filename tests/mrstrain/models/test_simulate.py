@@ -135,6 +135,7 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     assert done.exit_code == 1, done.output
     assert re.search(r"luboz, b: ONLY \d+% of the load was reached", done.output)
     assert "luboz: c was not tried" in done.output
+    assert re.search(r"b: no equilibrium was found beyond \d+% of the load, .*\(least det F 0\.\d+\)", done.output)
     told = json.loads((out / "luboz" / "simulation.json").read_text())["outcome"]
     reached = told["b"]["reached"]
     assert 0.0 < reached < 1.0
@@ -172,6 +173,8 @@ def test_a_law_that_is_not_stable_at_the_strain_reached_is_told_and_ends_with_st
         outcome = json.loads((tmp_path / travel / "soft" / "simulation.json").read_text())
         assert outcome["outcome"]["a"]["reached"] == 1.0  # so it is the law alone that counts
         told[travel + " noted"] = outcome["notes"]
+        begun = told[travel].output.split("plate displacement")[0]
+        assert "soft: the material of fat softens until its stress falls" in begun  # before anything is computed
     assert told["0.2mm"].exit_code == 0, told["0.2mm"].output
     assert told["1.4mm"].exit_code == 1, told["1.4mm"].output
     note = r"a: the material of fat is not stable \(Drucker\) in \d+\.\d% of its volume\."
