@@ -33,6 +33,13 @@ def whole_file(path: Path) -> Iterator[Path]:
             part.unlink()
 
 
+def remove_partial(folder: Path) -> None:
+    """Remove what a process that was killed had begun to write into a folder with `whole_file`."""
+    for part in folder.glob(".*.partial.*"):
+        with suppress(OSError):
+            part.unlink()
+
+
 def write_whole(path: Path, text: str) -> None:
     """Write a text file (UTF-8, lines ending as they are given), whole or not at all; errors as `whole_file`."""
     with whole_file(path) as part:

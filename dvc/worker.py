@@ -6,9 +6,8 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, TimeoutError as FutureTimeout
+from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as FutureTimeout, wait
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -23,6 +22,7 @@ Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """`map`, or one that computes in several processes: a task and items, both picklable, give results in their order."""
 
 _POLL_S = 0.5
+_UNWIND_S = 5.0  # for threads to end after an error or interrupt
 _MEMORY = {
     "MALLOC_ARENA_MAX": "2",  # glibc keeps memory for each thread otherwise: a fifth more
     # What glibc comes to by itself, unless it is told otherwise: Dask has its workers hand every freed array back to
@@ -35,6 +35,8 @@ _MEMORY = {
 class Worker(AbstractContextManager["Worker", None]):
     """One child process that runs one task at a time; if it dies, that task fails and the next gets a fresh process.
 
+    So it is after an interrupt, too, which ends the process with its task.
+
     Native code (ITK, numba, BLAS) may use ``threads`` threads in it: results of elastix are equal bit for bit only for
     equal numbers. It is kept alive between tasks, because the first use of elastix costs many seconds.
     """
@@ -44,6 +46,7 @@ class Worker(AbstractContextManager["Worker", None]):
             raise ValueError(f"`threads` of a worker must be 1 or more; got {threads}.")
         self.threads = threads
         self._executor: ProcessPoolExecutor | None = None
+        self._killed = False
         self._lock = threading.Lock()
 
     def start(self, *modules: str) -> None:
@@ -59,16 +62,17 @@ class Worker(AbstractContextManager["Worker", None]):
         """
         with self._lock:
             executor = self._running()
+            future = None
+
+            def watched() -> None:
+                if self._killed:  # while the process was being started
+                    executor.shutdown(wait=False, kill_workers=True)
+                elif watch is not None:
+                    watch()
+
             try:
                 future = executor.submit(task, *args)
-                while True:
-                    try:
-                        return future.result(timeout=_POLL_S)  # type: ignore[no-any-return]
-                    except FutureTimeout:
-                        if future.done():
-                            raise  # the task itself timed out on something; not ours to hide
-                        if watch is not None:
-                            watch()
+                return _result(future, watched)  # type: ignore[no-any-return]
             except (TerminatedWorkerError, ShutdownExecutorError) as died:
                 executor.shutdown(wait=False, kill_workers=True)
                 self._executor = None
@@ -79,9 +83,15 @@ class Worker(AbstractContextManager["Worker", None]):
                     "your own elastix parameter files with several metrics, set "
                     '(UseMultiThreadingForMetrics "false").'
                 ) from died
+            finally:
+                if future is not None and not future.done():  # an interrupt: the task would be waited for
+                    executor.shutdown(wait=False, kill_workers=True)
+                    self._executor = None
 
     def _running(self) -> ProcessPoolExecutor:
         """The child process, started where there is none."""
+        if self._killed:
+            raise WorkerError("The process was ended before its task began.")
         if self._executor is None:
             count = str(self.threads)
             names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
@@ -91,7 +101,8 @@ class Worker(AbstractContextManager["Worker", None]):
         return self._executor
 
     def kill(self) -> None:
-        """End the child process at once, whatever it is doing; a task in it raises `WorkerError`."""
+        """End the child process at once, whatever it does; a task in it, and any later one, raises `WorkerError`."""
+        self._killed = True
         if (executor := self._executor) is not None:
             executor.shutdown(wait=False, kill_workers=True)
 
@@ -144,18 +155,39 @@ def _workers(
             local.worker = next(idle)
         return task(item, local.worker)
 
-    pool = ThreadPoolExecutor(at_once)
+    pool, begun = ThreadPoolExecutor(at_once), list[Future[Any]]()
+
+    def each(task: Callable[[Any, Worker], Any], items: Iterable[Any]) -> Iterable[Any]:
+        those = [pool.submit(one, task, item) for item in items]
+        begun.extend(those)
+        return map(_result, those)
+
     try:
-        yield lambda task, items: pool.map(partial(one, task), items)
+        yield each
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)  # first, so that no thread begins the next item
         for worker in workers:
             worker.kill()
+        wait(begun, _UNWIND_S)  # a thread that computes in this process cannot be ended
         raise
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=False, cancel_futures=True)
         for worker in workers:
             worker.close()
+
+
+def _result(future: "Future[_T]", watch: Callable[[], None] = lambda: None) -> _T:
+    """The result of a task, with ``watch`` called meanwhile.
+
+    It is not waited for without end: a signal that reaches another thread is seen by this one when it runs again.
+    """
+    while True:
+        try:
+            return future.result(timeout=_POLL_S)
+        except FutureTimeout:
+            if future.done():
+                raise  # the task itself timed out on something; not ours to hide
+            watch()
 
 
 def _imported(module: str) -> None:

@@ -185,24 +185,23 @@ def _limited(
     points_mm, triangles = surface
     box_mm3 = float(np.prod(np.ptp(points_mm, axis=0)))
     expected = _SECONDS_PER_TRIANGLE * len(triangles) + _SECONDS_PER_CELL * box_mm3 / (0.12 * edge_mm**3)
-    worker = Worker(threads=1)
-    over = threading.Timer(limit_s, worker.kill)
-    over.start()
-    try:
-        return worker.run(
-            "meshing", _tetrahedra, points_mm, triangles, edge_mm, envelope_mm, lattice,
-            watch=lambda: watch(_guessed((time.monotonic() - began) / expected)),
-        )  # fmt: skip
-    except WorkerError as ended:
-        if time.monotonic() - began >= limit_s:
-            raise MrstrainError(
-                f"Meshing was stopped at its time limit of {limit_s:.0f} s. Use a longer edge length, remove specks "
-                "and holes of a few voxels from the label map (they take most time), or raise the limit."
-            ) from ended
-        raise
-    finally:
-        over.cancel()
-        worker.close()
+    with Worker(threads=1) as worker:
+        over = threading.Timer(limit_s, worker.kill)
+        over.start()
+        try:
+            return worker.run(
+                "meshing", _tetrahedra, points_mm, triangles, edge_mm, envelope_mm, lattice,
+                watch=lambda: watch(_guessed((time.monotonic() - began) / expected)),
+            )  # fmt: skip
+        except WorkerError as ended:
+            if time.monotonic() - began >= limit_s:
+                raise MrstrainError(
+                    f"Meshing was stopped at its time limit of {limit_s:.0f} s. Use a longer edge length, remove "
+                    "specks and holes of a few voxels from the label map (they take most time), or raise the limit."
+                ) from ended
+            raise
+        finally:
+            over.cancel()
 
 
 def _tetrahedra(

@@ -4,6 +4,7 @@ import atexit
 import ctypes
 import gc
 import logging
+import os
 import signal
 import sys
 import textwrap
@@ -27,6 +28,7 @@ mrstrain measures strain inside soft tissue from pairs of MR images, and compare
 mrstrain --help lists all commands, and mrstrain COMMAND --help the options of one."""
 _WIDTH = 100  # of a line of an error
 _M_ARENA_MAX = -8  # of glibc's malloc.h
+_TOLD_TO_END = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit status
 
 app = typer.Typer(
     name="mrstrain",
@@ -108,6 +110,12 @@ def main() -> None:
         if not isinstance(error, MrstrainError):
             raise
         _stop(str(error))
+    except SystemExit as ended:
+        if ended.code in _TOLD_TO_END:  # threads that still compute would be waited for
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            os._exit(int(ended.code))
+        raise
 
 
 def _interrupted(*_: object) -> None:

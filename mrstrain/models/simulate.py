@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import fe
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import remove_partial, write_whole
 from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
@@ -108,6 +108,7 @@ def simulate(
     for folder in (target / one.name for one in chosen):
         make_output(folder)
         fe.clear_simulation(folder)
+        remove_partial(folder)
         for left in folder.glob(f"*{ENDING}"):  # checkpoints of the current loads are kept
             if left.name.removesuffix(ENDING) not in plates:
                 left.unlink()

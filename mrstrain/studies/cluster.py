@@ -29,7 +29,7 @@ from mrstrain.studies.stages import StageResult
 _TELL_EVERY_S = 1.0
 _TRIED = "This was computed at the second attempt."
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
-_LOOK_EVERY_S, _LOST_S = 5.0, 120.0
+_LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts its own processes
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself

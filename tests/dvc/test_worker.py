@@ -9,8 +9,10 @@ import threading
 import time
 
 import numpy as np
+import psutil
 import pytest
 
+from dvc import register
 from dvc.errors import RegistrationError, WorkerError
 from dvc.worker import Worker, each_in_workers, side_by_side
 
@@ -94,6 +96,50 @@ def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():
         worker.run("sleeping", time.sleep, 60.0)
     assert time.monotonic() - began < 20.0
     worker.close()
+
+
+def test_an_interrupt_leaves_no_process_and_the_next_task_has_a_fresh_one(monkeypatch):
+    """As in a notebook, where the worker is still there after it."""
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with Worker(threads=1) as worker:
+            first, _ = worker.run("asking", _process)
+            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+            with pytest.raises(KeyboardInterrupt):
+                worker.run("sleeping", time.sleep, 60.0)
+            began = time.monotonic()
+            assert worker.run("asking", _process)[0] != first
+            assert time.monotonic() - began < 20.0
+            assert not psutil.pid_exists(first)
+    finally:
+        signal.signal(signal.SIGINT, usual)
+
+
+def test_an_interrupted_registration_leaves_no_process_and_the_next_begins(tiny_pair):
+    def interrupt(stage: str, fraction: float) -> None:
+        raise KeyboardInterrupt
+
+    def workers() -> set[int]:
+        return {one.pid for one in psutil.Process().children() if "popen_loky" in " ".join(one.cmdline())}
+
+    before = workers()
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            register(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.labels.region("bone"), progress=interrupt)
+        assert workers() <= before
+
+
+def test_a_worker_that_is_killed_while_its_process_starts_runs_no_task():
+    worker = Worker(threads=1)
+    began = time.monotonic()
+    running = worker._running
+    worker._running = lambda: (running(), worker.kill())[0]  # type: ignore[method-assign]
+    with pytest.raises(WorkerError, match="sleeping"):
+        worker.run("sleeping", time.sleep, 60.0)
+    worker.close()
+    assert time.monotonic() - began < 20.0
+    with pytest.raises(WorkerError, match="ended before its task began"):
+        Worker.run(worker, "asking", _process)
 
 
 def test_each_item_is_done_once_and_one_that_fails_ends_all() -> None:

@@ -144,12 +144,14 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     assert [row.split(",")[1] for row in rows if row.startswith("b,")] == [f"{reached:.4g}"] * 2
     # a second run leaves nothing of the first, and takes nothing that it did not write
     (out / "luboz" / "mine.csv").write_text("kept")
+    (out / "luboz" / ".4711.partial.a.vtu").write_text("half")  # of a process that was killed
     again = CliRunner().invoke(
         app, ["simulate", str(mesh_file), "--set", "luboz", "--load", "d=1", *PLATE, "--out", str(out)]
     )
     assert again.exit_code == 0, again.output
     assert [path.name for path in (out / "luboz").glob("*.vtu")] == ["d.vtu"]
     assert (out / "luboz" / "mine.csv").read_text() == "kept"
+    assert not (out / "luboz" / ".4711.partial.a.vtu").exists()
 
 
 def test_tissue_squeezed_beyond_its_law_is_told(mesh_file: Path, tmp_path: Path) -> None:

@@ -10,18 +10,24 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
 import pytest
 
+from dvc.io.images.write import write_labels
+from fe import write_tet_mesh
 from mrstrain.studies.run import forecast
+from mrstrain.truth.accuracy import _finished
+from tests.fe.test_meshing import half_onion
+from tests.fe.test_simulate import dome
 from tests.processes import under_way, wait_for
 
 SAID_S, OVER_S = 2.0, 10.0
 
 
-def interrupted(command: list[str], err: Path, begun: Callable[[], bool], *, group: bool) -> None:
+def interrupted(command: list[str], err: Path, begun: Callable[[psutil.Process], bool], *, group: bool) -> None:
     """Start a command, interrupt it or its group once it has begun, and see that it ends as it should."""
     with err.open("wb") as errors:
         process = subprocess.Popen(
@@ -29,7 +35,7 @@ def interrupted(command: list[str], err: Path, begun: Callable[[], bool], *, gro
             start_new_session=True,
         )  # fmt: skip
     try:
-        wait_for(begun, process)
+        wait_for(lambda: begun(psutil.Process(process.pid)), process)
         below = psutil.Process(process.pid).children(recursive=True)
         (os.killpg if group else os.kill)(process.pid, signal.SIGINT)
         began = time.monotonic()
@@ -54,7 +60,7 @@ def test_a_study_ends_and_goes_on(images, tmp_path, group):
     shutil.copytree(images, study)
     records = study / "results" / ".study"
     command = ["run", str(study), "--only", "register", "--workers", "1"]
-    interrupted(command, tmp_path / "err.txt", lambda: under_way(records, "register Load1"), group=group)
+    interrupted(command, tmp_path / "err.txt", lambda _: under_way(records, "register Load1"), group=group)
     assert (records / "register repeat.json").is_file()
     told = forecast(study, only=["register"])
     assert told["register repeat"] == "done already"
@@ -67,5 +73,69 @@ def test_a_registration_ends(images, tmp_path, group):
     given = [str(images / name) for name in ("Load0.nii.gz", "Load1.nii.gz")]
     out, err = tmp_path / "out", tmp_path / "err.txt"
     command = ["register", *given, "--align", "image", "--out", str(out)]
-    interrupted(command, err, lambda: err.exists() and b"aligning" in err.read_bytes(), group=group)
+    interrupted(command, err, lambda _: err.exists() and b"aligning" in err.read_bytes(), group=group)
     assert not out.exists() or list(out.iterdir()) == []
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command, when it is interrupted, and what is kept and not there then."""
+
+    command: list[str]
+    begun: Callable[[psutil.Process], bool]
+    kept: Path | None
+    absent: Path
+
+
+def simulating(images: Path, folder: Path) -> Case:
+    write_tet_mesh(folder / "dome.vtu", dome((4, 6, 6)), {})
+    loads = [given for n in range(9) for given in ("--load", f"Load{n}=2,{0.3 * n}")]
+    plate = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0", "--workers", "1", "--set", "luboz"]
+    command = ["simulate", str(folder / "dome.vtu"), *loads, *plate, "--out", str(folder / "out")]
+    out = folder / "out" / "luboz"
+    return Case(command, lambda _: (out / "Load0.vtu").is_file(), out / "Load0.restart.npz", out / "simulation.json")
+
+
+def meshing(images: Path, folder: Path) -> Case:
+    """A mesh of minutes, interrupted in the native code that makes it."""
+    write_labels(folder / "labels.nii.gz", half_onion())
+    (folder / "names.csv").write_text("label,name\n1,bone\n2,fat\n3,skin\n")
+    command = ["mesh", str(folder / "labels.nii.gz"), "--names", str(folder / "names.csv"), "--edge-mm", "0.5"]
+    return Case([*command, "--out", str(folder / "made.vtu")], works_below, None, folder / "made.vtu")
+
+
+def works_below(process: psutil.Process) -> bool:
+    """Whether a process that was started by this one has computed for a second since it was there."""
+    with suppress(psutil.Error):
+        return any(sum(one.cpu_times()[:2]) > 3.0 for one in process.children(recursive=True))
+    return False
+
+
+def measuring_accuracy(images: Path, folder: Path) -> Case:
+    command = ["accuracy", "--out", str(folder / "out"), "--spacing", "2.3", "--seed", "1", "--workers", "1"]
+    motions = [given for name in ("still", "Load1", "Load2") for given in ("--motion", name)]
+    run, report = folder / "out" / "runs" / "gauss-newton_2.3x2.3x2.3mm_snr25_still_1.npz", folder / "out/report.html"
+    return Case([*command, *motions], lambda _: run.is_file(), run, report)
+
+
+def running_a_cohort(images: Path, folder: Path) -> Case:
+    shutil.copytree(images, folder / "study")
+    records = folder / "study" / "results" / ".study"
+    command = ["cohort", str(folder / "study"), "--out", str(folder / "out"), "--workers", "1"]
+    return Case(command, lambda _: under_way(records, "register repeat"), None, folder / "out" / "report.html")
+
+
+@pytest.mark.parametrize(
+    ("case", "group"),
+    [
+        (simulating, False), (simulating, True), (meshing, False), (meshing, True), (measuring_accuracy, False),
+        (running_a_cohort, True),
+    ],
+)  # fmt: skip
+def test_a_command_ends_and_keeps_what_is_finished(case, group, images, tmp_path):
+    made = case(images, tmp_path)
+    interrupted(made.command, tmp_path / "err.txt", made.begun, group=group)
+    assert made.kept is None or made.kept.is_file()
+    assert not made.absent.exists()
+    if case is measuring_accuracy:
+        assert [run.case.motion for run in _finished(tmp_path / "out" / "runs").values()] == ["still"]
