@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dvc.mesh import TetMesh
-from fe import Checkpoint, LoadState, LoadStep, NeoHooke, Plate, Problem, write_tet_mesh
+from fe import Checkpoint, LoadState, LoadStep, NeoHooke, Plate, Problem, cauchy_stress, write_tet_mesh
 from fe.simulation_files import fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.cli.app import app
 from mrstrain.studies import stages
@@ -44,31 +44,33 @@ def test_going_on_from_a_load_ends_where_an_uncut_run_ends(whole, tmp_path: Path
     states, told, _ = whole
     write_checkpoint(tmp_path / "a.npz", states[0].checkpoint, "this")
     again, lines, _ = run(earlier=[read_checkpoint(tmp_path / "a.npz", "this")])
-    for state, other in zip(states, again, strict=True):
-        assert np.abs(other.u_mm - state.u_mm).max() < 1e-9
-        assert np.abs(other.pressure_mpa - state.pressure_mpa).max() < 1e-9
-        assert other.force_n == pytest.approx(state.force_n, abs=1e-9)
-        assert other.plate.turn_deg == pytest.approx(state.plate.turn_deg, abs=1e-9)
+    for state, other in zip(states, again, strict=True):  # bit for bit
+        for array in ("u_mm", "pressure_mpa", "gradients", "on_plate"):
+            assert np.array_equal(getattr(other, array), getattr(state, array)), array
         assert (other.reached, other.iterations) == (state.reached, state.iterations)
-        assert len(other.curve) == len(state.curve)
-        assert other.on_plate.tolist() == state.on_plate.tolist()
+        for at, there in zip(state.curve, other.curve, strict=True):
+            assert all(np.array_equal(getattr(at, name.name), getattr(there, name.name)) for name in fields(at))
     assert 0 < len(lines) < len(told)
     assert lines == told[-len(lines) :]  # the second load's steps, and none of the first's
     assert not any("moved" in line for line in lines)
 
 
 @pytest.mark.parametrize("load", ["a", "b"])
-def test_going_on_from_the_middle_of_a_load(whole, load: str) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_going_on_from_the_middle_of_a_load(whole, load: str, share: float) -> None:
     states, told, way = whole
     on_way = [kept for name, kept in way if name == load and kept.reached < 1.0]
-    kept = on_way[len(on_way) // 2]
+    kept = on_way[int(share * len(on_way))]
     assert 0.0 < kept.reached < 1.0
     again, lines, _ = run(earlier=[kept] if load == "a" else [states[0].checkpoint, kept])
-    assert len(lines) < len(told)
+    assert share == 0.0 or len(lines) < len(told)
     for state, other in zip(states, again, strict=True):
         assert other.reached == 1.0
         assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
-        assert np.abs(other.u_mm - state.u_mm).max() < 0.02 * np.abs(state.u_mm).max()  # other steps, other places
+        # the increments are others, and so are the places where the tape holds: what docs/simulate.md says of digits
+        assert np.abs(other.u_mm - state.u_mm).max() < 1e-3 * np.abs(state.u_mm).max()
+        stress, there = (cauchy_stress(one, dome((3, 4, 4)), LAWS) for one in (state, other))
+        assert np.abs(there - stress).max() < 1e-2 * np.abs(stress).max()
 
 
 def test_a_path_whose_time_is_over_ends_where_it_stands_and_goes_on(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,17 @@ def spline(direction: np.ndarray) -> BSpline:
     """A random B-spline around the world's origin."""
     control = Grid((8, 9, 10), (4.0, 5.0, 3.5), -direction @ np.array([14.0, 20.0, 15.75]), direction)
     return BSpline(control, np.random.default_rng(1).normal(scale=0.6, size=(3, 8, 9, 10)))
+
+
+def test_a_transform_that_is_written_again_has_the_same_values_and_another_time(tmp_path: Path) -> None:
+    first = write_itk_transform(tmp_path / "first.h5", spline(OBLIQUE), MOTION)
+    time.sleep(1.1)  # HDF5 counts seconds
+    again = write_itk_transform(tmp_path / "again.h5", spline(OBLIQUE), MOTION)
+    assert first.read_bytes() != again.read_bytes()
+    one, other = (sitk.ReadTransform(str(path)).Downcast() for path in (first, again))
+    for n in range(2):
+        assert one.GetNthTransform(n).GetParameters() == other.GetNthTransform(n).GetParameters()
+        assert one.GetNthTransform(n).GetFixedParameters() == other.GetNthTransform(n).GetFixedParameters()
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".tfm"])
