@@ -1,11 +1,9 @@
 """Transforms of elastix and ITK, and displacement images, read to a Deformation: fixed to moving points, LPS mm."""
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import SimpleITK as sitk
@@ -17,15 +15,13 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
 from dvc.errors import ImageFileError, InputError, ParameterError
 from dvc.images.image import Grid
-from dvc.images.itk_image import from_sitk as image_from_sitk
 from dvc.io import StrPath
 from dvc.io.images.read import read_header
 from dvc.io.images.text_headers import nrrd_fields
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
 from dvc.io.transforms.interface_spline import read_interface_spline
+from dvc.io.transforms.itk_file import flat, is_itk_transform, read_itk_transform
 
-_ITK_SUFFIXES = (".h5", ".hdf5", ".tfm", ".mat")
-_ITK_TEXT = b"#Insight Transform File"
 _NO_INITIAL = "NoInitialTransform"
 _SAME_CONTROL = 1e-6
 
@@ -76,8 +72,8 @@ def read_transform(path: StrPath) -> Deformation:
         raise InputError(f"{place}: no such transform file. Check the path.")
     if place.suffix.lower() == ".npz":
         return read_interface_spline(place)
-    if place.suffix.lower() in _ITK_SUFFIXES or place.read_bytes()[: len(_ITK_TEXT)] == _ITK_TEXT:
-        return _read_itk(place)
+    if is_itk_transform(place):
+        return read_itk_transform(place)
     return _read_elastix(place, ())
 
 
@@ -215,7 +211,7 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
     first = _read_elastix(initial, (*chain, path.resolve()))
     how = _word(parameters, "HowToCombineTransforms", "Compose")
     if how == "Compose":
-        return Composed([*_flat(first), last])
+        return Composed([*flat(first), last])
     if how != "Add":
         raise ParameterError(f"{path}: HowToCombineTransforms must be Compose or Add; it is '{how}'.")
     splines = [part for part in (first, last) if isinstance(part, BSpline)]
@@ -230,7 +226,7 @@ def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
         named = path.parent / _word(parameters, "TransformFileName", "")
         if not named.is_file():
             raise InputError(f"{path}: the ITK transform file '{named.name}' (TransformFileName) is missing.")
-        return _read_itk(named)
+        return read_itk_transform(named)
     _require(parameters, tuple(_ELASTIX))
     ignored = _word(parameters, "UseDirectionCosines", "true") == "false" and "Direction" in parameters
     if ignored and np.abs(_numbers(parameters, "Direction", 9) - np.eye(3).ravel()).max() > _SAME_CONTROL:
@@ -270,48 +266,6 @@ def _numbers(parameters: Parameters, name: str, count: int) -> FloatArray:
     if len(values) != count:
         raise ParameterError(f"{name} has {len(values)} numbers; {count} are needed.")
     return values
-
-
-def _flat(deformation: Deformation) -> tuple[Deformation, ...]:
-    return deformation.parts if isinstance(deformation, Composed) else (deformation,)
-
-
-def _read_itk(path: Path) -> Deformation:
-    try:
-        return _from_sitk(sitk.ReadTransform(os.fspath(path)))
-    except RuntimeError as failure:
-        reason = str(failure).strip().splitlines()[-1].strip()
-        raise InputError(f"{path}: cannot be read as an ITK transform file ({reason}).") from failure
-    except InputError as wrong:
-        raise InputError(f"{path}: {wrong}") from wrong
-
-
-def _from_sitk(transform: Any) -> Deformation:
-    transform = transform.Downcast()
-    if transform.GetDimension() != 3:
-        raise InputError(f"a {transform.GetDimension()}D transform; a 3D one is needed.")
-    if isinstance(transform, sitk.CompositeTransform):  # the one added last acts first
-        parts = [transform.GetNthTransform(n) for n in reversed(range(transform.GetNumberOfTransforms()))]
-        flat = [piece for part in parts for piece in _flat(_from_sitk(part))]
-        return flat[0] if len(flat) == 1 else Composed(flat or [RigidMotion.identity()])
-    if isinstance(transform, sitk.BSplineTransform):
-        if transform.GetOrder() != 3:
-            raise InputError(f"a B-spline of order {transform.GetOrder()}; only cubic B-splines are supported.")
-        images = [image_from_sitk(image) for image in transform.GetCoefficientImages()]
-        return BSpline(images[0][0], np.stack([coefficients for _, coefficients in images]))
-    if isinstance(transform, sitk.DisplacementFieldTransform):
-        grid, u = image_from_sitk(transform.GetDisplacementField())
-        return SampledDisplacement(grid, u.astype(np.float64, copy=False))
-    if isinstance(transform, sitk.TranslationTransform):
-        return Affine(np.eye(3), np.array(transform.GetOffset()))
-    if transform.GetTransformEnum() == sitk.sitkIdentity:
-        return RigidMotion.identity()
-    if not hasattr(transform, "GetMatrix"):
-        raise InputError(f"transforms of the kind {transform.GetName()} are not supported.")
-    matrix = np.reshape(transform.GetMatrix(), (3, 3))
-    shift = transform.GetTranslation() if hasattr(transform, "GetTranslation") else np.zeros(3)
-    rigid = isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform)
-    return (RigidMotion if rigid else Affine).about(np.array(transform.GetCenter()), matrix, np.array(shift))
 
 
 def _frame_beside(path: Path) -> str | None:

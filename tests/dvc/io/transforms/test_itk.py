@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Composed, RigidMotion, SampledDisplacement
+from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.io.transforms.read import read_transform
 from dvc.io.transforms.write import write_itk_transform
@@ -39,8 +42,10 @@ def test_a_transform_that_is_written_again_has_the_same_values_and_another_time(
         assert one.GetNthTransform(n).GetFixedParameters() == other.GetNthTransform(n).GetFixedParameters()
 
 
-@pytest.mark.parametrize("suffix", [".h5", ".tfm"])
-@pytest.mark.parametrize("direction", [np.eye(3), OBLIQUE, OBLIQUE @ PERMUTED, OBLIQUE @ MIRROR])
+@pytest.mark.parametrize(  # an HDF5 file takes a second
+    ("suffix", "direction"),
+    [(".h5", OBLIQUE @ MIRROR), *((".tfm", d) for d in (np.eye(3), OBLIQUE, OBLIQUE @ PERMUTED, OBLIQUE @ MIRROR))],
+)
 @pytest.mark.parametrize("then", [None, MOTION])
 def test_itk_transform_is_the_same_map(
     tmp_path: Path, suffix: str, direction: np.ndarray, then: RigidMotion | None
@@ -99,8 +104,15 @@ def itk_transforms() -> dict[str, sitk.Transform]:
     }
 
 
-@pytest.mark.parametrize("suffix", [".h5", ".tfm", ".txt"])
-@pytest.mark.parametrize("kind", list(itk_transforms()))
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    [
+        *((kind, ".tfm") for kind in itk_transforms()),
+        ("composite", ".h5"),
+        ("composite", ".txt"),
+        ("similarity", ".mat"),
+    ],
+)
 def test_reads_itk_kinds(tmp_path: Path, kind: str, suffix: str) -> None:
     transform = itk_transforms()[kind]
     path = tmp_path / f"transform{suffix}"
@@ -131,3 +143,64 @@ def test_elastix_file_that_names_an_itk_file(tmp_path: Path) -> None:
     write_itk_transform(tmp_path / "map.h5", spline(OBLIQUE), MOTION)
     (tmp_path / "T.txt").write_text('(Transform "File")\n(TransformFileName "map.h5")\n')
     assert isinstance(read_transform(tmp_path / "T.txt"), Composed)
+
+
+def damaged(path: Path, change: Callable[[bytes], bytes]) -> Path:
+    """A B-spline after an affine map as a file of ITK, its bytes changed; .mat has the affine map alone."""
+    if path.suffix == ".mat":
+        sitk.WriteTransform(itk_transforms()["affine"], str(path))
+    else:
+        write_itk_transform(path, spline(OBLIQUE), MOTION)
+    path.write_bytes(change(path.read_bytes()))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("cut.tfm", lambda b: b[: len(b) // 2], "last line has no end"),
+        ("cut.tfm", lambda b: b[: b.rindex(b"FixedParameters")], "the BSplineTransform lacks numbers"),
+        ("cut.tfm", lambda b: b[: b.index(b"#Transform 1")], "no transform"),
+        ("count.tfm", lambda b: b.replace(b"FixedParameters: 8 9", b"FixedParameters: 8 8"), r"grid of \[8\.0, 8\.0"),
+        ("large.tfm", lambda b: b.replace(b"FixedParameters: 8 9", b"FixedParameters: 8 1e308"), "on a grid of"),
+        ("nan.tfm", lambda b: b.replace(b"FixedParameters: 8 9", b"FixedParameters: nan 9"), "not finite"),
+        ("word.tfm", lambda b: b.replace(b"FixedParameters", b"FixedParamaters"), "unexpected line 'FixedParamaters"),
+        ("bytes.tfm", lambda b: b.replace(b"BSpline", b"BSpl\xffne"), "can't decode"),
+        ("kind.tfm", lambda b: b.replace(b"BSplineTransform_d", b"BSplineTransformxd"), "is no transform"),
+        ("cut.mat", lambda b: b[:-1], "cannot be read as an ITK transform file"),
+        ("cut.mat", lambda b: b[: b.index(b"fixed") - 20], "without their fixed"),
+        ("bytes.mat", lambda b: b.replace(b"Affine", b"\xffffine"), "can't decode"),
+        ("nan.mat", lambda b: b[:-8] + np.array(np.nan).tobytes(), "not finite"),
+        ("rows.mat", lambda b: b[:4] + b"\xff\xff\xff\xff" + b[8:], "not one of numbers in a column"),
+        ("cut.h5", lambda b: b[:-1], "incomplete or damaged: it has"),
+        ("more.h5", lambda b: b[:5000] + b[4900:5000] + b[5000:], "incomplete or damaged: it has"),
+        ("text.h5", lambda b: b"#Insight" * 20, "no HDF5 file"),
+        ("heap.h5", lambda b: b.replace(b"GCOL", b"GCOM"), "cannot be read as an ITK transform file"),
+    ],
+)  # fmt: skip
+def test_a_damaged_file_is_refused(tmp_path: Path, name: str, change: Callable[[bytes], bytes], message: str) -> None:
+    path = damaged(tmp_path / name, change)
+    with pytest.raises(InputError, match=message) as refusal:
+        read_transform(path)
+    assert str(path) in str(refusal.value)
+
+
+def _dies(_: Path) -> None:
+    os._exit(3)
+
+
+def _does_not_end(_: Path) -> None:
+    time.sleep(60.0)
+
+
+@pytest.mark.parametrize(
+    ("reader", "most_s", "message"), [(_dies, 60.0, "ended the process"), (_does_not_end, 0.5, "does not end")]
+)
+def test_a_file_that_harms_its_reader_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: Callable[[Path], None], most_s: float, message: str
+) -> None:
+    path = damaged(tmp_path / "map.h5", bytes)
+    monkeypatch.setattr("dvc.io.transforms.itk_file._MOST_S", most_s)
+    monkeypatch.setattr("dvc.io.transforms.itk_file._read", reader)
+    with pytest.raises(InputError, match=rf"map\.h5: .*{message}"):
+        read_transform(path)
