@@ -1,6 +1,7 @@
 """Array types, and read-only arrays for value objects."""
 
 import copyreg
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -33,6 +34,13 @@ def frozen(values: npt.ArrayLike, dtype: type[_T]) -> npt.NDArray[_T]:
         raise InputError(f"An array of numbers is needed; got {shown(values)}.") from failure
     array.flags.writeable = False
     return array
+
+
+def numbers(words: Sequence[str]) -> FloatArray:
+    """Words of a file as numbers (n,); ValueError for one that is none, such as 1_0, which only Python takes for 10."""
+    if odd := [word for word in words if "_" in word]:
+        raise ValueError(f"could not convert string to float: '{odd[0]}'")
+    return np.array([float(word) for word in words], dtype=np.float64)
 
 
 def as_points(points_mm: npt.ArrayLike) -> FloatArray:

@@ -1,6 +1,5 @@
 """Mesh files with the names of regions and surface sets, readable by ParaView; names of the standard surface sets."""
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
+from dvc.own_files import read_json
 
 BONE, SKIN, CUT = "bone", "skin", "cut"
 """Surface sets: the interface with bone, which is fixed; the outer surface, which the plate may touch; and the
@@ -81,7 +81,7 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     names_file = place.with_suffix(".json")
     if names_file.is_file():
         try:
-            table = json.loads(names_file.read_text(encoding="utf-8"))["regions"]
+            table = read_json(names_file)["regions"]
             names = {f"region {number}": str(name) for number, name in table.items()}
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
             raise InputError(f"{names_file}: the table of region names is missing or damaged ({damaged}).") from damaged

@@ -1,12 +1,9 @@
 """Files of a simulation: reading results, resuming after an interruption, and removing old files."""
 
 import hashlib
-import io
-import json
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,6 +12,7 @@ from dvc import TetMesh
 from dvc.atomic_files import whole_file
 from dvc.errors import InputError
 from dvc.mesh import outer_faces
+from dvc.own_files import read_arrays, read_json
 from dvc.software import software_key
 from fe.load_path import Checkpoint, PlateState
 from fe.materials import from_vector
@@ -44,7 +42,7 @@ def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
 
 
 def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
-    content = json.loads((place / RECORD).read_text(encoding="utf-8"))
+    content = read_json(place / RECORD)
     given, outcome = content["parameters"], content["outcome"]
     paths = tuple(tuple(LoadStep(**load) for load in path) for path in given["paths"])
     loads = {load.name: load for path in paths for load in path}
@@ -91,7 +89,7 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
 def clear_simulation(folder: Path) -> None:
     """Remove the files of an earlier simulation, listed in its own record, so that old and new are never mixed."""
     try:
-        loads = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["outcome"])
+        loads = list(read_json(folder / RECORD)["outcome"])
     except (OSError, ValueError, KeyError, TypeError):
         return
     of_loads = [name for load in loads for name in (f"{load}.vtu", f"{load}.inp", f"{load}.feb", f"log-{load}.txt")]
@@ -134,13 +132,13 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, made_from: str) -> None
 def read_checkpoint(path: Path, made_from: str) -> Checkpoint | None:
     """Read the checkpoint of a load; None if there is no file, it is damaged, or it was made from other inputs."""
     try:
-        with np.load(io.BytesIO(path.read_bytes())) as file:
-            if str(file["made_from"]) != made_from:
-                return None
-            reached, stages, iterations, seconds = file["counts"].tolist()
-            nodes, places, rotation, turns = (file[name] for name in _CONTACT)
-            curve = [PlateState(*at) for at in zip(*(file[name] for name in _PLATE), strict=True)]
-            contact = ContactStatus(nodes, places, rotation, bool(turns))
-            return Checkpoint(reached, int(stages), tuple(curve), int(iterations), seconds, file["unknowns"], contact)
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        file = read_arrays(path)
+        if str(file["made_from"]) != made_from:
+            return None
+        reached, stages, iterations, seconds = file["counts"].tolist()
+        nodes, places, rotation, turns = (file[name] for name in _CONTACT)
+        curve = [PlateState(*at) for at in zip(*(file[name] for name in _PLATE), strict=True)]
+        contact = ContactStatus(nodes, places, rotation, bool(turns))
+        return Checkpoint(reached, int(stages), tuple(curve), int(iterations), seconds, file["unknowns"], contact)
+    except (OSError, ValueError, KeyError):
         return None

@@ -1,8 +1,6 @@
 """One run of an accuracy study: a phantom pair is made, registered, and compared with the truth voxel by voxel."""
 
-import io
 import json
-import zipfile
 import zlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -18,6 +16,7 @@ from dvc.atomic_files import whole_file
 from dvc.deformation.protocol import Motion
 from dvc.images.noise import signal_to_noise
 from dvc.images.resample import shows
+from dvc.own_files import read_arrays
 from dvc.trust.error_model import to_surface_mm
 from dvc.worker import Worker
 from phantoms.anatomy import Heel
@@ -143,13 +142,14 @@ class ErrorSamples:
     def read(cls, path: Path, key: Callable[[AccuracyCase], str]) -> Self | None:
         """Read what `write` wrote; None where the file is missing, damaged, or its key is not that of its case."""
         try:
-            with np.load(io.BytesIO(path.read_bytes())) as file:
-                head = json.loads(str(file["head"]))
-                case = AccuracyCase(**head["case"] | {"spacing_mm": tuple(head["case"]["spacing_mm"])})
-                if head["format"] != _FORMAT or head["key"] != key(case):
-                    return None
-                return cls(case=case, **{n: head[n] for n in _NUMBERS}, **{n: file[n] for n in _ARRAYS})
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+            file = read_arrays(path)
+            head = json.loads(str(file["head"]))
+            case = AccuracyCase(**head["case"] | {"spacing_mm": tuple(head["case"]["spacing_mm"])})
+            if head["format"] != _FORMAT or head["key"] != key(case):
+                return None
+            kept = {n: head[n] for n in _NUMBERS} | {n: file[n] for n in _ARRAYS}
+            return cls(case=case, **kept)
+        except (OSError, KeyError, ValueError):
             return None
 
 

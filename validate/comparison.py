@@ -1,6 +1,5 @@
 """Comparison of a measurement with finite-element models under one or several loads: results, files and plots."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,6 +13,7 @@ from dvc import LabelMap, TetMesh, Verdict
 from dvc.arguments import checked
 from dvc.atomic_files import whole_folder, write_json
 from dvc.errors import InputError
+from dvc.own_files import read_json
 from dvc.report.drawing import png_bytes
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
 from dvc.trust.verdict import LEVELS, worst
@@ -210,7 +210,7 @@ class Comparison:
         place = Path(folder)
         areas, overlaps, agreements, skin = tables.read_tables(place)
         try:
-            content = json.loads((place / tables.RECORD).read_text(encoding="utf-8"))
+            content = read_json(place / tables.RECORD)
             low, high = content["parameters"]["strains"]
             pairs = {load: tuple((a, b) for a, b in of) for load, of in content["not_told_apart"].items()}
             verdicts = {load: _verdict(of) for load, of in content["verdict_by_load"].items()}

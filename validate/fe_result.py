@@ -4,7 +4,6 @@ A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, 
 .inp, ANSYS .cdb) and a table of nodal displacements (.csv: node number, and three components).
 """
 
-import json
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -18,6 +17,7 @@ from dvc.deformation.nodal import OnMesh
 from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
+from dvc.own_files import read_json
 from dvc.tables import read_table, refuse_half_a_line
 from validate.rigid_parts import without_rigid_parts
 from validate.tetrahedra import linear_tetrahedra
@@ -139,7 +139,7 @@ def _names_of_regions(place: Path) -> dict[str, str]:
     tables = ((place.with_name("simulation.json"), "region_numbers_in_vtu"), (place.with_suffix(".json"), "regions"))
     for file, key in tables:
         try:
-            record = json.loads(file.read_text(encoding="utf-8"))
+            record = read_json(file)
             if table := record.get(key) or record.get("parameters", {}).get(key):
                 return {f"region {number}": str(name) for number, name in table.items()}
         except (OSError, ValueError, AttributeError):

@@ -1,7 +1,6 @@
 """The files of a comparison: tables of all results, fields on the mesh, and maps on the voxels of the image."""
 
 import csv
-import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
@@ -15,6 +14,7 @@ from dvc import Image, StrainField, evaluate_on_grid, write_image, write_vectors
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_csv
 from dvc.errors import InputError
+from dvc.own_files import read_json
 from dvc.report.drawing import figure_files
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
@@ -114,7 +114,7 @@ def _rows(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
 def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
     """Remove the files of an earlier comparison, and its folders of loads that are no longer compared."""
     try:
-        earlier = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["coverage_ml"])
+        earlier = list(read_json(folder / RECORD)["coverage_ml"])
     except (OSError, ValueError, KeyError, TypeError):
         return
     pictures = (path for stem in OF_ALL_LOADS for path in figure_files(folder / stem))

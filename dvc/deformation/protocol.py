@@ -122,7 +122,8 @@ class Affine:
     def about(cls, centre_mm: FloatArray, matrix: FloatArray, translation_mm: FloatArray) -> Self:
         """The map about a centre, then a translation: x = A (X - c) + c + t."""
         centre = np.asarray(centre_mm, dtype=np.float64)
-        return cls(matrix, centre - matrix @ centre + translation_mm)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by the class
+            return cls(matrix, centre - matrix @ centre + translation_mm)
 
     def apply(self, points_mm: FloatArray) -> FloatArray:
         """Where the points (n, 3) mm go."""

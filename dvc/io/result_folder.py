@@ -1,7 +1,6 @@
 """The results folder of one loaded image: the names of its files (given here only), their writers and readers."""
 
 import csv
-import json
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from functools import partial
@@ -26,6 +25,7 @@ from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
 from dvc.io.transforms.interface_spline import FILE as INTERFACE_SPLINE
 from dvc.io.transforms.read import read_displacement, read_transform
 from dvc.io.transforms.write import ELASTIX_FILES
+from dvc.own_files import read_json
 from dvc.trust.error_model import ErrorModel, ErrorTable, Interval, Uncertainty, read_error_model
 from dvc.trust.verdict import Verdict
 
@@ -65,9 +65,10 @@ class ResultFolder:
             told = read_quality(folder)
             try:
                 verdict = Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
-            except (KeyError, TypeError, InputError) as failure:
-                raise InputError(f"{folder / QUALITY}: the verdict is missing ({failure!r}). {AGAIN}") from failure
-            aligned_on = str(told.get("alignment", {}).get("on", ""))
+                aligned_on = str(told.get("alignment", {}).get("on", ""))
+            except (KeyError, TypeError, AttributeError, InputError) as failure:
+                what = f"the verdict or the alignment is missing or damaged ({failure!r})"
+                raise InputError(f"{folder / QUALITY}: {what}. {AGAIN}") from failure
         return cls(folder, read_error_model(model).tables[0] if model.is_file() else None, verdict, aligned_on)
 
     @property
@@ -130,12 +131,9 @@ def read_quality(folder: Path) -> dict[str, Any]:
     """The content of ``quality.json``."""
     path = folder / QUALITY
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(told, dict):
-            raise ValueError(f"a {type(told).__name__}, not an object")
+        return read_json(path)
     except (OSError, ValueError) as failure:
         raise InputError(f"{path}: the quality of the registration cannot be read ({failure}). {AGAIN}") from failure
-    return told
 
 
 def motion_in(alignment: dict[str, Any]) -> RigidMotion:

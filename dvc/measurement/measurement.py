@@ -176,7 +176,7 @@ class Measurement:
             quality, alignment = Quality.from_dict(told), dict(told["alignment"])
             files.motion_in(alignment)
             at = np.array(told[_SHOWN].split(), dtype=np.float64) if told.get(_SHOWN) else None
-        except (KeyError, TypeError, ValueError) as failure:
+        except (KeyError, TypeError, ValueError, AttributeError) as failure:
             what = f"damaged, or not written by `Measurement.write` ({failure!r})"
             raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
         maps = files.read_maps(place)

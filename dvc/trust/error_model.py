@@ -14,6 +14,7 @@ from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d
@@ -22,6 +23,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.own_files import read_json
 from dvc.trust.quality import plain
 from dvc.trust.regions import SHEAR_THRESHOLDS
 
@@ -130,7 +132,7 @@ class ErrorModel:
 def read_error_model(path: Path | str) -> ErrorModel:
     """Read a file of `ErrorModel.write`; InputError if it cannot be read or is not an error model."""
     try:
-        return _parsed(Path(path).read_text(encoding="utf-8"))
+        return _parsed(read_json(Path(path)))
     except (OSError, ValueError, KeyError, TypeError) as failure:
         what = f"not an error model written by `mrstrain accuracy` ({type(failure).__name__}: {failure})."
         raise InputError(f"{path}: {what}") from failure
@@ -139,11 +141,10 @@ def read_error_model(path: Path | str) -> ErrorModel:
 def error_model_of(preset: str) -> ErrorModel | None:
     """The error model that comes with a named preset; None where there is none."""
     stored = files("dvc.trust") / "error_models" / f"{preset}.json"
-    return _parsed(stored.read_text(encoding="utf-8")) if stored.is_file() else None
+    return _parsed(json.loads(stored.read_text(encoding="utf-8"))) if stored.is_file() else None
 
 
-def _parsed(text: str) -> ErrorModel:
-    told = json.loads(text)
+def _parsed(told: Mapping[str, Any]) -> ErrorModel:
     if told["format"] != _FORMAT:
         raise ValueError(f"the format is {told['format']}; {_FORMAT} is needed")
 

@@ -1,6 +1,5 @@
 """The figures by which a registration is judged: folding, similarity, bone, landmarks, noise floor."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
+from dvc.own_files import read_json
 from dvc.trust.verdict import Verdict
 
 _SIMILARITIES = ("before", "after_rigid", "after_all")
@@ -176,7 +176,7 @@ def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
 def read_noise_floor(path: Path) -> NoiseFloor | None:
     """The noise floor in the ``quality.json`` of a repeat scan, or None; InputError for another file."""
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))["noise_floor"]
+        told = read_json(path)["noise_floor"]
         return None if told is None else NoiseFloor.from_dict(told)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not the quality of a repeat scan ({error!r}). Register that scan again.") from error

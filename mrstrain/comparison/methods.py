@@ -1,12 +1,12 @@
 """Text for a methods section, generated from the records of the compared results."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from dvc.io.images.read import format_of
 from dvc.io.result_folder import PROVENANCE, QUALITY
+from dvc.own_files import read_json
 from dvc.registration.engines import methods_of
 from dvc.report.page import NIIVUE
 from fe import LoadStep
@@ -73,8 +73,7 @@ def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
 
 def _record(place: Path) -> Record:
     try:
-        record = json.loads(place.read_text(encoding="utf-8"))
-        return record if isinstance(record, dict) else {}
+        return read_json(place)
     except (OSError, ValueError):
         return {}
 

@@ -1,6 +1,5 @@
 """Files of the models by load, and the settings with which they are read: mesh, unit, frame."""
 
-import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.errors import ExtentError, InputError
 from dvc.mesh import box_told
+from dvc.own_files import read_json
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import matrix_of, read_matrix
 from mrstrain.records.outcome import with_reasons
@@ -133,7 +133,7 @@ def loads_of(place: Path, has_mesh: bool) -> list[str]:
 def _outcome(place: Path, key: str) -> dict[str, float]:
     """The fraction "reached" or "stable_share" by load, from mrstrain's simulation record; empty without one."""
     try:
-        outcome = json.loads((_folder(place) / "simulation.json").read_text(encoding="utf-8"))["outcome"]
+        outcome = read_json(_folder(place) / "simulation.json")["outcome"]
         return {load: float(of[key]) for load, of in outcome.items()}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

@@ -1,6 +1,5 @@
 """`converge`: mesh convergence, the same loads on meshes of several sizes, and the extrapolated limits."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from dvc import read_labels
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
+from dvc.own_files import read_json
 from dvc.report.drawing import figure_files, save_figure
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
 from mrstrain.models.mesh import mesh as make_mesh
@@ -138,7 +138,7 @@ def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> 
         return False
     hashes = {role: [file_hash(path) for path in paths] for role, paths in inputs.items()}
     try:
-        record = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
+        record = read_json(place.with_suffix(".json"))
         known = {role: [f["sha256"] for f in files] for role, files in record["inputs"].items()}
         return bool(known == hashes and record["parameters"]["bones"] == list(bones))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes

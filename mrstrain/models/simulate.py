@@ -1,6 +1,5 @@
 """`simulate`: a mesh under the loads of a plate, for one or more material sets."""
 
-import json
 import re
 import tempfile
 import threading
@@ -14,6 +13,7 @@ import numpy as np
 import fe
 from dvc.atomic_files import remove_partial, write_whole
 from dvc.errors import InputError, MrstrainError, OutputError
+from dvc.own_files import read_json
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
@@ -214,7 +214,7 @@ class _Run:
 def _mesh_made(place: Path) -> dict[str, object] | None:
     """How `mesh` made a mesh, from the record next to it; None for meshes of other programs."""
     try:
-        record = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
+        record = read_json(place.with_suffix(".json"))
         made = {"edge_mm": record["parameters"]["edge_mm"], "pytetwild": record["versions"]["pytetwild"]}
         return made if record["command"] == "mesh" else None
     except (OSError, ValueError, KeyError, TypeError):

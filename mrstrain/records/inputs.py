@@ -1,6 +1,7 @@
 """What a command was given, read and checked before anything is computed."""
 
 import shutil
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -51,7 +52,9 @@ def read_subject(
 def read_matrix(path: Path) -> FloatArray:
     """Read a 4 x 4 matrix from a text file of four rows; InputError for any other file."""
     try:
-        rows = np.loadtxt(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty file is refused below
+            rows = np.loadtxt(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a matrix of four rows of four numbers ({error}).") from error
     return matrix_of(rows, str(path))

@@ -1,7 +1,6 @@
 """What a measurement was made with, by the record beside it. Its files are found again by their names and contents."""
 
 import glob
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any, Self
 
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, ResultFolder
+from dvc.own_files import read_json
 from mrstrain.records.provenance import file_hash
 
 _WHAT = {
@@ -44,7 +44,7 @@ class MeasuredWith:
         if not path.is_file():
             return None
         try:
-            record = json.loads(path.read_text(encoding="utf-8"))
+            record = read_json(path)
             listed = {role: record["inputs"][role] for role in _WHAT if record["inputs"].get(role)}
             inputs = {role: (str(files[0]["name"]), str(files[0]["sha256"])) for role, files in listed.items()}
             return cls(path, inputs, dict(record["parameters"]))

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from dvc import read_labels, write_labels
 from dvc.atomic_files import write_whole
-from dvc.errors import OutputError
+from dvc.errors import InputError, OutputError
 from dvc.io.result_folder import REPORT, read_maps
+from dvc.own_files import read_json
 from mrstrain.models.simulate import LOADS
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import ALL, OnProgress
@@ -98,7 +99,11 @@ def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> N
     record = target / "phantom.json"
     heel = Heel(seed)
     if record.is_file():
-        old = json.loads(record.read_text(encoding="utf-8"))["parameters"]["seed"]
+        try:
+            old = read_json(record)["parameters"]["seed"]
+        except (OSError, ValueError, KeyError, TypeError) as failure:
+            what = f"{record}: not the record of a phantom, or damaged ({failure!r})."
+            raise InputError(f"{what} Choose another folder (out), or delete this one.") from failure
         if old != seed:
             raise OutputError(
                 f"{target} contains the phantom of seed {old}; choose another folder (out) for seed {seed}."
@@ -112,7 +117,7 @@ def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> N
         phantom(target, seed=seed, progress=progress)
     texts = {size: _text(seed, size) for size in (False, True)}
     study = target / FILE
-    if study.exists() and study.read_text(encoding="utf-8") not in texts.values():
+    if study.exists() and study.read_text(encoding="utf-8", errors="replace") not in texts.values():
         return  # changed by the user; used unchanged
     if not full:
         grid = heel_grid(_COARSE_MM, heel.size)

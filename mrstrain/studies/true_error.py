@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import get_type_hints
 
 from dvc.atomic_files import write_csv
+from dvc.errors import InputError
 from dvc.report.page import Section, Table
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome
@@ -26,21 +27,29 @@ def write_errors(path: Path, errors: Mapping[str, Sequence[TissueError]], outcom
 
 
 def read_errors(path: Path, outcomes: Mapping[str, StageOutcome]) -> dict[str, tuple[TissueError, ...]]:
-    """Read the errors of `write_errors`, for the loads that have not been registered again since."""
+    """Read the errors of `write_errors`, for the loads that have not been registered again since.
+
+    InputError is raised for a row that is damaged.
+    """
     errors: dict[str, tuple[TissueError, ...]] = {}
     for row in _rows(path):
         if row[_MADE] and row[_MADE] == _made(outcomes, row["load"]):
-            values = {name: kind(row[name]) for name, kind in get_type_hints(TissueError).items()}
+            try:
+                values = {name: kind(row[name]) for name, kind in get_type_hints(TissueError).items()}
+            except (ValueError, TypeError) as failure:
+                what = f"the error of {row['load']} is damaged ({failure})"
+                raise InputError(f"{path}: {what}. Delete this file; `mrstrain demo` writes it anew.") from failure
             errors[row["load"]] = (*errors.get(row["load"], ()), TissueError(**values))
     return errors
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
     """Rows of an error table; none if the file is something else."""
-    if not path.is_file():
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error):
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
     return rows if rows and set(_HEADER) <= set(rows[0]) else []
 
 

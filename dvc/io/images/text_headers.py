@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import FloatArray
+from dvc.arrays import FloatArray, numbers
 from dvc.errors import ImageFileError
 from dvc.io.images.stored import StoredVolume, grid_of_axes, pick_volume, refuse_if_too_large
 
@@ -156,7 +156,9 @@ def _vector(path: Path, written: str, field: str) -> FloatArray:
     """The three numbers of ``(x,y,z)``."""
     if match := re.fullmatch(r"\(([^(),]*),([^(),]*),([^(),]*)\)", written):
         with suppress(ValueError):
-            return np.array([float(part) for part in match.groups()])
+            vector = numbers(match.groups())
+            if np.isfinite(vector).all():
+                return vector
     raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
 
 
@@ -238,19 +240,19 @@ def _detached_file(path: Path, name: str) -> Path:
 
 def _numbers_in(path: Path, text: str, field: str, count: int | None = None) -> list[float]:
     """Numbers of a field, ``count`` of them; refused if it is missing or damaged."""
-    numbers = []
+    found: list[float] = []
     with suppress(ValueError):
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    if not numbers or (count is not None and len(numbers) != count):
+        found = numbers(text.replace(",", " ").split()).tolist()
+    if not found or not np.isfinite(found).all() or (count is not None and len(found) != count):
         raise ImageFileError(f"{path}: the header's '{field}' is missing or not a list of numbers: '{text[:60]}'.")
-    return numbers
+    return found
 
 
 def _whole_numbers(path: Path, fields: Mapping[str, str], field: str) -> list[int]:
-    numbers = _numbers_in(path, fields.get(field, ""), field)
-    if not all(n.is_integer() and abs(n) < _LARGEST_SIZE for n in numbers):
-        raise ImageFileError(f"{path}: the header is damaged ('{field}' must be whole numbers; got {numbers}).")
-    return [int(n) for n in numbers]
+    found = _numbers_in(path, fields.get(field, ""), field)
+    if not all(n.is_integer() and abs(n) < _LARGEST_SIZE for n in found):
+        raise ImageFileError(f"{path}: the header is damaged ('{field}' must be whole numbers; got {found}).")
+    return [int(n) for n in found]
 
 
 def _unit_of_length(path: Path, units: set[str]) -> str:

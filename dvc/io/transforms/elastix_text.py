@@ -26,6 +26,8 @@ def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
         if not line:
             continue
         shown = line if len(line) < 80 else line[:77] + "..."
+        if not line.isprintable():
+            raise ParameterError(f"line {number}: {shown!r} has characters that are no text. The file is damaged.")
         if not (line.startswith("(") and line.endswith(")")):
             raise ParameterError(f"line {number}: '{shown}' is not in brackets; write (Name value ...).")
         pieces = line[1:-1].split('"')

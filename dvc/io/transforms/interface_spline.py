@@ -1,9 +1,6 @@
 """A displacement with strain discontinuities as a file of our own, as no ITK transform can hold one."""
 
-import io
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +12,11 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.interface_spline import NUMBERS, Interfaces, InterfaceSpline
 from dvc.errors import InputError, MrstrainError
 from dvc.images.image import Grid
+from dvc.own_files import read_arrays
 
 FILE = "spline_with_borders.npz"
 """Its name in a folder of results."""
 _FORMAT = 1
-_UNREADABLE = OSError, EOFError, zlib.error, zipfile.BadZipFile, ValueError, KeyError, TypeError
 
 
 def write_interface_spline(path: Path, spline: InterfaceSpline) -> None:
@@ -38,16 +35,16 @@ def write_interface_spline(path: Path, spline: InterfaceSpline) -> None:
 def read_interface_spline(path: Path | str) -> InterfaceSpline:
     """Read what `write_interface_spline` wrote."""
     try:
-        with np.load(io.BytesIO(Path(path).read_bytes())) as file:
-            if int(file["format"]) != _FORMAT:
-                raise ValueError(f"the format is {int(file['format'])}; {_FORMAT} is needed")
-            if json.loads(str(file["numbers"])) != NUMBERS:
-                raise ValueError(f"interfaces were located with {file['numbers']}, now with {NUMBERS}; register again")
-            control = _grid(file["control"])
-            own = frozen(file["own"], np.int64)
-            borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
-            return InterfaceSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
-    except (*_UNREADABLE, MrstrainError) as failure:
+        file = read_arrays(Path(path))
+        if int(file["format"]) != _FORMAT:
+            raise ValueError(f"the format is {int(file['format'])}; {_FORMAT} is needed")
+        if json.loads(str(file["numbers"])) != NUMBERS:
+            raise ValueError(f"interfaces were located with {file['numbers']}, now with {NUMBERS}; register again")
+        control = _grid(file["control"])
+        own = frozen(file["own"], np.int64)
+        borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
+        return InterfaceSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
+    except (OSError, ValueError, KeyError, TypeError, MrstrainError) as failure:
         why = f"{type(failure).__name__}: {failure}"
         what = "not a displacement with tissue interfaces written by `mrstrain register`"
         raise InputError(f"{path}: {what} ({why}).") from failure

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import SimpleITK as sitk
 
-from dvc.arrays import FloatArray
+from dvc.arrays import FloatArray, numbers
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
 from dvc.errors import InputError, WorkerError
@@ -86,7 +86,7 @@ def _of_text(path: Path) -> list[_Stored]:
         if name == "Transform":
             found.append({name: value.strip()})
         elif name in ("Parameters", "FixedParameters") and found and name not in found[-1]:
-            found[-1][name] = np.array(value.split(), dtype=np.float64)
+            found[-1][name] = numbers(value.split())
         else:
             raise InputError(f"the file is damaged (unexpected line '{line[:40]}'). Copy or export it again.")
     return [_Stored(f["Transform"], f.get("Parameters"), f.get("FixedParameters")) for f in found]

@@ -1,6 +1,6 @@
 """Transforms of elastix and ITK, and displacement images, read to a Deformation: fixed to moving points, LPS mm."""
 
-import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
 from dvc.arguments import checked
-from dvc.arrays import FloatArray
+from dvc.arrays import FloatArray, numbers
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
 from dvc.errors import ImageFileError, InputError, ParameterError
@@ -21,9 +21,11 @@ from dvc.io.images.text_headers import nrrd_fields
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
 from dvc.io.transforms.interface_spline import read_interface_spline
 from dvc.io.transforms.itk_file import flat, is_itk_transform, read_itk_transform
+from dvc.own_files import read_json
 
 _NO_INITIAL = "NoInitialTransform"
 _SAME_CONTROL = 1e-6
+_MOST_POINTS = 100_000  # along an axis of control points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +133,8 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
         )
     signs = np.array([1.0, 1.0, 1.0] if frames[0] == "LPS" else [-1.0, -1.0, 1.0])
     try:
-        return SampledDisplacement(stored.grid, values * signs)
+        with np.errstate(invalid="ignore"):  # a NaN may be one that signals
+            return SampledDisplacement(stored.grid, values * signs)
     except InputError as wrong:
         raise ImageFileError(f"{place}: {wrong}") from wrong
 
@@ -153,13 +156,15 @@ def bspline_from_elastix(parameters: Parameters) -> BSpline:
     if _word(parameters, "UseCyclicTransform", "false") == "true":
         raise ParameterError("UseCyclicTransform is true; cyclic B-splines are not supported.")
     size = _numbers(parameters, "GridSize", 3)
+    if np.any((size != np.floor(size)) | (size < 1) | (size > _MOST_POINTS)):
+        raise ParameterError(f"GridSize must be three whole numbers from 1 to {_MOST_POINTS}; it is {size.tolist()}.")
     shape = (int(size[0]), int(size[1]), int(size[2]))
     index = _numbers(parameters, "GridIndex", 3) if "GridIndex" in parameters else np.zeros(3)
     spacing, origin = _numbers(parameters, "GridSpacing", 3), _numbers(parameters, "GridOrigin", 3)
     direction = np.eye(3)
     if "GridDirection" in parameters:
         direction = _numbers(parameters, "GridDirection", 9).reshape(3, 3).T  # written column by column
-    flat = _numbers(parameters, "TransformParameters", 3 * int(np.prod(size)))
+    flat = _numbers(parameters, "TransformParameters", 3 * math.prod(shape))
     coefficients = np.stack([c.reshape(shape, order="F") for c in flat.reshape(3, -1)])
     try:
         control = Grid(shape, spacing, origin + direction @ (spacing * index), direction)
@@ -174,11 +179,13 @@ def _affine_from_elastix(parameters: Parameters) -> Affine:
         return Affine(np.eye(3), _numbers(parameters, "TransformParameters", 3))
     centre = _numbers(parameters, "CenterOfRotationPoint", 3)
     if kind == "AffineTransform":
-        numbers = _numbers(parameters, "TransformParameters", 12)
-        return Affine.about(centre, numbers[:9].reshape(3, 3), numbers[9:])
-    numbers = _numbers(parameters, "TransformParameters", 7)  # SimilarityTransform: versor, translation, scale
-    versor = sitk.VersorTransform(tuple(float(v) for v in (*numbers[:3], np.sqrt(1.0 - numbers[:3] @ numbers[:3]))))
-    return Affine.about(centre, numbers[6] * np.reshape(versor.GetMatrix(), (3, 3)), numbers[3:6])
+        given = _numbers(parameters, "TransformParameters", 12)
+        return Affine.about(centre, given[:9].reshape(3, 3), given[9:])
+    given = _numbers(parameters, "TransformParameters", 7)  # SimilarityTransform: versor, translation, scale
+    if not given[:3] @ given[:3] <= 1.0:
+        raise ParameterError("TransformParameters do not begin with a versor: its three numbers are longer than 1.")
+    versor = sitk.VersorTransform(tuple(float(v) for v in (*given[:3], np.sqrt(1.0 - given[:3] @ given[:3]))))
+    return Affine.about(centre, given[6] * np.reshape(versor.GetMatrix(), (3, 3)), given[3:6])
 
 
 _ELASTIX: dict[str, Callable[[Parameters], Deformation]] = {
@@ -260,11 +267,13 @@ def _numbers(parameters: Parameters, name: str, count: int) -> FloatArray:
     if name not in parameters:
         raise ParameterError(f"{name} is missing; {count} numbers are needed.")
     try:
-        values = np.array(parameters[name], dtype=np.float64)
+        values = numbers(parameters[name])
     except ValueError as failure:
         raise ParameterError(f"{name} has a value that is not a number ({failure}).") from failure
     if len(values) != count:
         raise ParameterError(f"{name} has {len(values)} numbers; {count} are needed.")
+    if name != "TransformParameters" and not np.isfinite(values).all():  # in these a registration may have diverged
+        raise ParameterError(f"{name} has numbers that are not finite.")
     return values
 
 
@@ -274,9 +283,9 @@ def _frame_beside(path: Path) -> str | None:
     if not beside.is_file():
         return None
     try:
-        header = json.loads(beside.read_text(encoding="utf-8"))
+        header = read_json(beside)
         frame, unit = header.get("frame"), header.get("unit", "mm")
-    except (OSError, ValueError, AttributeError) as failure:
+    except (OSError, ValueError) as failure:
         raise ImageFileError(f"{beside}: cannot be read as a JSON object ({failure}).") from failure
     if unit != "mm" or header.get("configuration", "reference") != "reference":
         raise ImageFileError(f"{beside}: a displacement in mm in the reference configuration is needed; got {header}.")

@@ -6,8 +6,10 @@ with those that elastix knows before anything runs.
 
 import difflib
 import json
+import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -19,6 +21,9 @@ from dvc.io.transforms.elastix_text import parse_parameters
 _FOLDER = files("dvc.registration.elastix") / "parameters"
 _KINDS = "Metric|Transform|Optimizer|Interpolator|ImageSampler|FixedImagePyramid|MovingImagePyramid|Registration"
 _LABEL = re.compile(rf"^({_KINDS})\d*")
+
+_COUNTS = {"NumberOfResolutions": (1, 20), "MaximumNumberOfIterations": (0, 1_000_000)}
+"""Numbers by which elastix, and the time left, count: the least and the most."""
 
 # What mrstrain itself decides, so that results are reproducible and can be read back.
 _ALWAYS: dict[str, tuple[str, ...]] = {
@@ -132,9 +137,23 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
         for value in parameters.get(kind, ()):
             if value not in components:
                 raise ParameterError(f'{name}: elastix has no {kind} "{value}"; {_nearest(value, components)}')
-    if "Transform" not in parameters:
+    for parameter, values in parameters.items():
+        if odd := [value for value in values if not _could_be_meant(value)]:
+            raise ParameterError(f"{name}: {parameter} has the value '{odd[0]}', which is not finite.")
+        least, most = _COUNTS.get(parameter, (0, 0))
+        if most and not (values and all(re.fullmatch(r"\d{1,9}", v) and least <= int(v) <= most for v in values)):
+            given = " ".join(values)[:40]
+            raise ParameterError(f"{name}: {parameter} takes whole numbers from {least} to {most}; it has '{given}'.")
+    if not parameters.get("Transform"):
         raise ParameterError(f'{name}: (Transform "...") is missing; give a B-spline or Euler transform.')
     return Preset(name, text, parameters)
+
+
+def _could_be_meant(value: str) -> bool:
+    """Whether a value is a word or a finite number."""
+    with suppress(ValueError):
+        return math.isfinite(float(value))
+    return True
 
 
 def _nearest(name: str, known: Sequence[str] | frozenset[str]) -> str:

@@ -190,6 +190,17 @@ def test_files_with_the_same_borders_share_them_and_no_others_do(spline, borders
         assert np.array_equal(found.grid.origin_mm, other.grid.origin_mm)
 
 
+def test_a_damaged_file_is_refused(spline, tmp_path):
+    path = tmp_path / "first.npz"
+    write_interface_spline(path, spline)
+    whole = path.read_bytes()
+    entry = whole.rindex(b"PK\x01\x02")  # of the last array, in the table at the end
+    for at, byte in ((entry + 10, 99), (entry + 8, 1), (len(whole) // 2, whole[len(whole) // 2] ^ 8)):
+        path.write_bytes(whole[:at] + bytes([byte]) + whole[at + 1 :])
+        with pytest.raises(InputError, match=r"first\.npz: not a displacement with tissue interfaces"):
+            read_interface_spline(path)
+
+
 def test_what_does_not_fit_together_is_refused(spline, borders):
     other = control_grid(GRID, np.full(3, 5.0))
     with pytest.raises(GeometryError, match="the same control grid"):

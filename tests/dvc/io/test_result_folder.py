@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ import pytest
 from dvc.deformation.protocol import Affine
 from dvc.deformation.strain import StrainField, plate_axes
 from dvc.deformation.strain_maps import strain_maps
+from dvc.errors import InputError
 from dvc.images.image import Grid, Image, Mask
-from dvc.io.result_folder import in_axes
+from dvc.io.result_folder import QUALITY, ResultFolder, in_axes
 from dvc.measurement.subject import Subject
 
 GRID = Grid((5, 6, 7), np.array([1.0, 1.5, 2.0]), np.array([-3.0, 4.0, 8.0]))
@@ -59,3 +61,23 @@ def test_the_lowest_point_of_the_bone_lies_furthest_along_the_plates_normal(norm
     )
     np.testing.assert_allclose(subject.lowest_bone_point_mm, GRID.points_at(np.array(lowest, dtype=np.float64)))
     assert replace(subject, bone=None).lowest_bone_point_mm is None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b'{"verdict": {"level": "tr\xffst", "reasons": []}}', "can't decode"),
+        (b'{"verdict": {"level": "trust", "reasons": []}', "cannot be read"),
+        (b"[" * 100_000, "cannot be read"),
+        (b'["verdict"]', "a list, not an object"),
+        (b'{"verdict": {"level": "trust", "reasons": []}, "mean": NaN}', "NaN is no number"),
+        (b'{"verdict": {"level": "trust", "reasons": []}, "mean": 1e400}', "1e400 is no number"),
+        (b'{"verdict": {"level": "trust", "reasons": []}, "alignment": []}', "the verdict or the alignment is"),
+        (b'{"verdict": {"level": "trust"}}', "the verdict or the alignment is"),
+    ],
+    ids=lambda given: str(given)[:60],
+)
+def test_a_damaged_quality_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / QUALITY).write_bytes(content)
+    with pytest.raises(InputError, match=rf"quality\.json: .*{message}"):
+        ResultFolder.at(tmp_path)

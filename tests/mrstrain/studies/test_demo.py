@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dvc import StrainField, evaluate_on_grid, read_labels, read_mask
-from dvc.errors import OutputError
+from dvc.errors import InputError, OutputError
 from dvc.report.page import Section
 from dvc.trust.verdict import Verdict
 from mrstrain.models.simulate import LOADS
@@ -58,6 +58,9 @@ def test_the_published_size_has_all_seven_sets(folder):
 
 def test_another_phantom_in_the_folder_is_refused(folder):
     with pytest.raises(OutputError, match="seed 1"):
+        _make(folder, 2, False, None)
+    (folder / "phantom.json").write_text('{"parameters": ')
+    with pytest.raises(InputError, match=r"phantom\.json: not the record of a phantom"):
         _make(folder, 2, False, None)
 
 
@@ -172,3 +175,8 @@ def test_errors_are_read_again_while_their_registrations_are_the_same(tmp_path):
     assert read_errors(tmp_path / "none.csv", outcomes("then")) == {}
     (tmp_path / "own.csv").write_text("a,b\n1,2\n")
     assert read_errors(tmp_path / "own.csv", outcomes("then")) == {}
+    (tmp_path / "own.csv").write_bytes(b"a,b\n\xff,2\n")
+    assert read_errors(tmp_path / "own.csv", outcomes("then")) == {}
+    (tmp_path / "error.csv").write_text((tmp_path / "error.csv").read_text().replace("12345", "12x45", 1))
+    with pytest.raises(InputError, match=r"error\.csv: the error of Load1 is damaged .*12x45.*Delete this file"):
+        read_errors(tmp_path / "error.csv", outcomes("then"))

@@ -52,6 +52,26 @@ def test_parameters_that_elastix_reads_are_accepted(tmp_path, line):
     read_parameter_file(path)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("Resolutions 2", "Resolutions 2.0", r"NumberOfResolutions takes whole numbers from 1 to 20; it has '2\.0'"),
+        ("Resolutions 2", "Resolutions 99999999999", "from 1 to 20"),
+        ("Resolutions 2", 'Resolutions ""', "from 1 to 20; it has ''"),
+        ("(Number", "(MaximumNumberOfIterations 10 1e308)\n(Number", "MaximumNumberOfIterations takes whole numbers"),
+        ("(Number", "(MaximumNumberOfIterations 500 nan)\n(Number", "has the value 'nan', which is not finite"),
+        ("(Number", "(MaximumStepLength 1e400)\n(Number", "has the value '1e400', which is not finite"),
+        ("Resolutions 2", "Resolutions 2\0\0", "characters that are no text"),
+        ('"BSplineTransform"', '""', r'\(Transform "\.\.\."\) is missing'),
+    ],
+)
+def test_values_that_elastix_cannot_count_with_are_refused(tmp_path, old, new, message):
+    path = tmp_path / "mine.txt"
+    path.write_text(GOOD.replace(old, new, 1))
+    with pytest.raises(ParameterError, match=message):
+        read_parameter_file(path)
+
+
 def test_real_files_of_others_are_accepted(real_data):
     path = real_data / "lung-landmarks" / "parameters.3D.NC.bspline.ASGD.001a.txt"
     assert "BSpline" in read_parameter_file(path).transform

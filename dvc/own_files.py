@@ -1,0 +1,67 @@
+"""JSON and npz files of our own, read whole: whatever is wrong with one is a ValueError.
+
+The libraries below raise a dozen kinds of error on a damaged file, and take some damage for numbers.
+"""
+
+import io
+import json
+import math
+import zipfile
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; OSError if it cannot be opened.
+
+    ValueError for anything else than an object, for NaN and infinity, which JSON has not, and for whole numbers beyond
+    64 bits.
+    """
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"), **_NUMBERS)
+    except RecursionError as endless:
+        raise ValueError("brackets in brackets without end") from endless
+    if not isinstance(told, dict):
+        raise ValueError(f"a {type(told).__name__}, not an object")
+    return told
+
+
+def _refused(word: str) -> NoReturn:
+    raise ValueError(f"{word[:40]} is no number of a file")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    return value if math.isfinite(value) else _refused(digits)
+
+
+def _whole(digits: str) -> int:
+    value = int(digits)
+    return value if abs(value) < 2**63 else _refused(digits)
+
+
+_NUMBERS: dict[str, Any] = {"parse_constant": _refused, "parse_float": _finite, "parse_int": _whole}
+
+
+def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an npz file by name, each read to its end so that its checksum counts.
+
+    OSError if the file cannot be opened; ValueError if it is damaged or something else.
+    """
+    content = io.BytesIO(path.read_bytes())
+    try:
+        with zipfile.ZipFile(content) as archive:
+            return {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
+    except Exception as damage:  # what zipfile, zlib and numpy raise depends on the byte that is wrong
+        raise ValueError(f"no arrays, or damaged ({type(damage).__name__}: {damage})") from damage
+
+
+def _array(content: bytes) -> npt.NDArray[Any]:
+    stream = io.BytesIO(content)
+    array: npt.NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    if stream.read(1):
+        raise ValueError("an array is longer than its header tells")
+    return array
