@@ -22,6 +22,8 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         told = json.loads(path.read_text(encoding="utf-8"), **_NUMBERS)
+    except UnicodeDecodeError as wrong:
+        raise ValueError(str(wrong)) from wrong  # whose repr would quote the whole file
     except RecursionError as endless:
         raise ValueError("brackets in brackets without end") from endless
     if not isinstance(told, dict):

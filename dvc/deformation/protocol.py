@@ -158,7 +158,8 @@ class RigidMotion(Affine):
 
     def __post_init__(self) -> None:
         Affine.__post_init__(self)
-        error = np.abs(self.rotation.T @ self.rotation - np.eye(3)).max()
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(self.rotation.T @ self.rotation - np.eye(3)).max()
         if not error < 1e-6 or np.linalg.det(self.rotation) < 0:
             raise InputError(f"The matrix is not a proper rotation (R^T R differs from I by {error:.2g}).")
 

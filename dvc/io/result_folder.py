@@ -236,8 +236,9 @@ def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel]
         with path.open(newline="", encoding="utf-8") as file:
             rows = [[row[name] for name in names] for row in csv.DictReader(file)]
         intervals = tuple(Interval(region, figure, *map(float, rest)) for region, figure, *rest in rows)
-    except (OSError, ValueError, KeyError, TypeError) as failure:
-        raise InputError(f"{path}: not a table of intervals ({failure!r}). {AGAIN}") from failure
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as failure:
+        why = f"{type(failure).__name__}: {failure}"
+        raise InputError(f"{path}: not a table of intervals ({why}). {AGAIN}") from failure
     return Uncertainty(sigma.values, intervals, model.tables[0]), model
 
 

@@ -120,8 +120,9 @@ def read_regions_csv(path: Path) -> list[RegionRow]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             return [_row_of(cells) for cells in csv.DictReader(file)]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as failure:
-        what = f"cannot be read as statistics by region ({failure!r}). Register this load again, or copy the file again"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as failure:
+        why = f"{type(failure).__name__}: {failure}"
+        what = f"cannot be read as statistics by region ({why}). Register this load again, or copy the file again"
         raise InputError(f"{path}: {what}.") from failure
 
 

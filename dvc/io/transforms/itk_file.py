@@ -28,7 +28,7 @@ _TEXT = b"#Insight Transform File"
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _OF_HDF5 = {0: (13, 40), 1: (13, 44), 2: (9, 28), 3: (9, 28)}  # by version: where the width and the file's length are
-_MOST_S, _BYTES_PER_S = 60.0, 5e6
+_MOST_S, _BYTES_PER_S = 30.0, 5e6
 _KIND = re.compile(r"(\w+)_(?:double|float)_(\d)_(\d)", re.ASCII)
 _ON_A_GRID = ("BSplineTransform", "DisplacementFieldTransform")
 _MATLAB_TYPES = {0: "<f8", 10: "<f4"}

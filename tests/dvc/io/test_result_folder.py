@@ -13,8 +13,10 @@ from dvc.deformation.strain import StrainField, plate_axes
 from dvc.deformation.strain_maps import strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Grid, Image, Mask
-from dvc.io.result_folder import QUALITY, ResultFolder, in_axes
+from dvc.io.result_folder import QUALITY, REGIONS, ResultFolder, in_axes
 from dvc.measurement.subject import Subject
+from dvc.trust.quality import read_noise_floor
+from dvc.trust.regions import read_regions_csv
 
 GRID = Grid((5, 6, 7), np.array([1.0, 1.5, 2.0]), np.array([-3.0, 4.0, 8.0]))
 MATRIX = np.array([[1.08, 0.11, -0.05], [0.02, 0.93, 0.17], [-0.09, 0.04, 1.03]])
@@ -81,3 +83,12 @@ def test_a_damaged_quality_is_refused(tmp_path: Path, content: bytes, message: s
     (tmp_path / QUALITY).write_bytes(content)
     with pytest.raises(InputError, match=rf"quality\.json: .*{message}"):
         ResultFolder.at(tmp_path)
+
+
+@pytest.mark.parametrize("name", [QUALITY, REGIONS])
+def test_a_refusal_of_a_file_that_is_no_text_does_not_quote_it(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"of a patient\n" * 100 + b"\xff")
+    reader = read_noise_floor if name == QUALITY else read_regions_csv
+    with pytest.raises(InputError, match=rf"{name}: .*can't decode byte 0xff") as refusal:
+        reader(tmp_path / name)
+    assert "patient" not in str(refusal.value)

@@ -8,12 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvc.errors import MrstrainError
+from dvc.errors import InputError, MrstrainError
 from dvc.images.image import Grid, Image
 from dvc.io.images.write import write_image
 from mrstrain.measurement.register import register
 from mrstrain.options.measurement import SubjectFiles
-from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
+from mrstrain.records.inputs import (
+    case_names,
+    make_output,
+    read_matrix,
+    read_subject,
+    refuse_small_disk,
+    refuse_touching_inputs,
+)
 from mrstrain.studies.run import run_studies
 
 
@@ -40,3 +47,18 @@ def test_without_a_bone_three_lines_tell_how_to_get_one(tmp_path: Path) -> None:
     assert len(str(told.value).splitlines()) <= 3
     for words in ("ITK-SNAP or 3D Slicer", "calcaneus", "on Load0.nii.gz", "NIfTI", "(--bone)", "(--align image)"):
         assert words in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "shape"),
+        ("1 0 nan 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n", "row 1, column 3 of the matrix is not finite"),
+        ("1 0 0 1_0\n0 1 0 6\n0 0 1 7\n0 0 0 1\n", "not a matrix of four rows"),
+        ("1 0 0 5\n0 1 0 6\n0 0 1 7\n", "4 x 4 is needed"),
+    ],
+)
+def test_a_damaged_matrix_is_refused_and_warns_of_nothing(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "m.txt").write_text(text)
+    with pytest.raises(InputError, match=rf"m\.txt: .*{message}"):
+        read_matrix(tmp_path / "m.txt")
