@@ -22,7 +22,7 @@ from dvc.trust.assessment import Similarity, assess
 from dvc.trust.error_model import ErrorModel
 from dvc.trust.landmarks import target_registration_error
 from dvc.trust.quality import NoiseFloor, Quality, plain
-from dvc.trust.verdict import Verdict
+from dvc.trust.verdict import Verdict, together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +109,8 @@ def quality_of(found: Registration, maps: StrainMaps, similarity: Similarity, ev
     quality = assess(
         maps, found.tissue, bone, similarity=similarity, landmark_errors_mm=errors, floor=floor, in_bone=choice.in_bone
     )
-    return replace(quality, verdict=with_caution(quality.verdict, choice))
+    doubts = [Verdict("caution", (found.bone_doubt,))] if found.bone_doubt else []
+    return replace(quality, verdict=with_caution(together([quality.verdict, *doubts]), choice))
 
 
 def with_caution(verdict: Verdict, choice: Regularisation) -> Verdict:

@@ -5,6 +5,7 @@ displacement u then maps the reference configuration straight to the bone-aligne
 tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
 """
 
+import logging
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,9 +27,14 @@ from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.noise import Noise, noise_of
 from dvc.images.tissue import tissue_mask
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
+from dvc.registration.bone_mask import mirrored_doubt
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
 from dvc.registration.engines import DEFAULT, engine_named
 from dvc.worker import Worker
+
+_log = logging.getLogger("dvc.registration")
+
+_MOSTLY_BONE = 0.8  # of the body: a shank or a knee is less than half bone
 
 _Scan = TypeVar("_Scan", Image, Mask, LabelMap)
 
@@ -105,6 +111,8 @@ class Registration:
         The regularisation weights that the engine used, and why.
     unlike_study : str
         Why the engine's error model does not apply to this pair; empty where it does.
+    bone_doubt : str
+        Why the bone mask may not lie on the bone (`dvc.registration.bone_mask`); empty where nothing tells.
     """
 
     reference: Image
@@ -118,6 +126,7 @@ class Registration:
     noise: tuple[Noise, Noise | None]
     choice: Regularisation = field(default_factory=Regularisation)
     unlike_study: str = ""
+    bone_doubt: str = ""
 
     @property
     def deformation(self) -> Deformation:
@@ -176,8 +185,11 @@ def register(
     with own as runner, ThreadPoolExecutor(1) as beside:
         beside.submit(engine.prepare)
         noise = beside.submit(noise_of, reference, loaded, body)
+        doubt = beside.submit(mirrored_doubt, reference, bone) if bone and chosen.align_on == "bone" else None
         pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
         of_noise = noise.result()  # known before the alignment, as a rule
+        if doubted := doubt.result() if doubt else "":
+            _log.warning(doubted)
         guess = start
         if isinstance(start, BSpline):  # and remains one
             guess = start.turned(turn.T)
@@ -187,7 +199,7 @@ def register(
         found = engine.find(pair, start=guess, seeds=_seeds(chosen)[1:], worker=runner, progress=tell)
     return Registration(
         reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,
-        time.monotonic() - began, of_noise, found.choice, found.unlike_study,
+        time.monotonic() - began, of_noise, found.choice, found.unlike_study, doubted,
     )  # fmt: skip
 
 
@@ -246,6 +258,11 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
             raise InputError(f"The {name} is not on the grid of the unloaded image; resample it with fit_mask.")
         if not (given.labels if isinstance(given, LabelMap) else given.inside).any():
             raise InputError(f"The {name} is empty.")
+    if bone is not None and (share := float(np.mean(bone.inside[body.inside]))) > _MOSTLY_BONE:
+        raise InputError(
+            f"The bone mask covers {share:.0%} of the body, so there is no soft tissue to measure. Check that bone "
+            "(--bone) is the mask of the bone, and not that of the body or of the whole image."
+        )
 
 
 def _seeds(settings: Settings) -> list[int]:

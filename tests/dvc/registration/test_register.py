@@ -251,6 +251,14 @@ def test_row_8_identical_images_are_refused(tiny_pair):
         register(tiny_pair.reference, tiny_pair.reference, bone=tiny_pair.bone)
 
 
+@pytest.mark.parametrize("of", ["image", "body"])
+def test_a_bone_mask_that_leaves_no_soft_tissue_is_refused(of, tiny_pair):
+    everything = np.ones(tiny_pair.reference.grid.shape, dtype=bool)
+    inside = everything if of == "image" else tissue_mask(tiny_pair.reference).inside
+    with pytest.raises(InputError, match=r"covers 100% of the body"):
+        register(tiny_pair.reference, tiny_pair.loaded, bone=Mask(tiny_pair.reference.grid, inside))
+
+
 def test_the_bone_is_needed_to_align_on_it(tiny_pair):
     with pytest.raises(InputError, match="--bone"):
         register(tiny_pair.reference, tiny_pair.loaded)

@@ -1,0 +1,59 @@
+"""Whether a bone mask lies on the bone: its edge must follow an edge of the image, and better than its mirror images.
+
+A mask that was written in another frame (RAS read as LPS) or with a flipped axis may still cover half of the bone. The
+alignment then follows soft tissue, and a strain that looks sound is measured relative to it.
+"""
+
+from itertools import product
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_gradient_magnitude
+
+from dvc.arrays import FloatArray
+from dvc.images.image import Image, Mask
+from dvc.images.resample import fill_missing
+
+_BLUR_MM, _LEAST_BLUR = 1.0, 0.5  # of the gradient: mm, and voxels
+_ENDS = 2  # voxels along the image's ends are left out: no gradient is known there
+_EDGE = 0.75  # of the largest voxel edge: voxels nearer than that to the surface are its edge
+_NEAR_MM = 2.5, 6.0  # distances of the voxels that it is compared with
+_BETTER = 1.2  # on heels, mirror images have at most 0.87 times the sharpness of a right mask
+_AXES = ("first", "second", "third")
+
+
+def mirrored_doubt(image: Image, bone: Mask) -> str:
+    """Why the mask may be mirrored, in a sentence; empty where it lies better on the image than its mirror images.
+
+    The mask is on the image's grid. Its sharpness is the median of the image's gradient at the mask's surface, over
+    that 2.5 to 6 mm inside and outside of it; mirror images are those along the voxel axes, about the image's middle.
+    """
+    blur = np.maximum(_BLUR_MM / image.grid.spacing_mm, _LEAST_BLUR)
+    gradient = gaussian_gradient_magnitude(fill_missing(image).values.astype(np.float32), blur)
+    i, j, k = (slice(_ENDS, n - _ENDS) for n in image.grid.shape)
+    gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
+    if not bone.inside.any() or bone.inside.all():
+        return ""
+    found = {flip: _sharpness(gradient, bone, flip) for flip in product((1, -1), repeat=3)}
+    own = found.pop((1, 1, 1))
+    best = max(found, key=lambda flip: found[flip])
+    if not found[best] > _BETTER * own:
+        return ""
+    axes = " and ".join(name for name, way in zip(_AXES, best, strict=True) if way < 0)
+    return (
+        f"The bone mask may be mirrored or in another frame (RAS for LPS): mirrored along the {axes} voxel axis, its "
+        f"surface would follow the edges of the unloaded image better (sharpness {found[best]:.2f} instead of "
+        f"{own:.2f}). Check it on the unloaded image."
+    )
+
+
+def _sharpness(gradient: FloatArray, bone: Mask, flip: tuple[int, ...]) -> float:
+    """Of the mask on the mirrored image, which is that of the mirrored mask on the image; 0 where nothing is near."""
+    edges = bone.grid.spacing_mm
+    box = bone.box(int(np.ceil(_NEAR_MM[1] / edges.min())) + 1)
+    inside, mirrored = bone.inside[box], gradient[tuple(slice(None, None, way) for way in flip)][box]
+    depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
+    at, near = depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
+    if not (at.any() and near.any()):
+        return 0.0
+    beside = float(np.median(mirrored[near]))
+    return float(np.median(mirrored[at])) / beside if beside > 0.0 else 0.0

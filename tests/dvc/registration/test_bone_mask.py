@@ -1,0 +1,56 @@
+"""A bone mask that does not lie on the bone."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from dvc.images.image import Image, Mask
+from dvc.measurement.judgement import Evidence
+from dvc.measurement.measurement import Measurement
+from dvc.measurement.subject import Subject
+from dvc.registration.bone_mask import mirrored_doubt
+from dvc.registration.gauss_newton.engine import GaussNewton
+from dvc.registration.register import Settings, register
+
+
+def flipped(mask: Mask, *axes: int) -> Mask:
+    return Mask(mask.grid, np.ascontiguousarray(np.flip(mask.inside, axes)))
+
+
+@pytest.mark.parametrize("pair", ["small_pair", "tiny_pair"])
+def test_a_right_mask_raises_no_doubt(pair, request):
+    heel = request.getfixturevalue(pair)
+    assert mirrored_doubt(heel.reference, heel.bone) == ""
+
+
+@pytest.mark.parametrize("pair", ["small_pair", "tiny_pair"])
+@pytest.mark.parametrize(("axes", "told"), [((1,), "second"), ((2,), "third"), ((0, 1), "first and second")])
+def test_a_mirrored_mask_is_told_with_its_axes(pair, axes, told, request):
+    heel = request.getfixturevalue(pair)
+    doubt = mirrored_doubt(heel.reference, flipped(heel.bone, *axes))
+    assert f"mirrored along the {told} voxel axis" in doubt
+
+
+def test_noise_and_a_mask_at_the_ends_of_the_image_raise_no_doubt(tiny_pair):
+    grid = tiny_pair.reference.grid
+    noise = Image(grid, np.random.default_rng(1).normal(100.0, 10.0, grid.shape).astype(np.float32))
+    assert mirrored_doubt(noise, tiny_pair.bone) == ""
+    for part in (np.s_[:5], np.s_[:, -3:], np.s_[:]):
+        inside = np.zeros(grid.shape, dtype=bool)
+        inside[part] = True
+        assert mirrored_doubt(noise, Mask(grid, inside)) == ""
+
+
+def test_the_doubt_is_warned_of_and_lowers_the_verdict(tiny_pair, caplog):
+    bone, weights = flipped(tiny_pair.bone, 0, 1), GaussNewton(bending=3.0, volume=300.0)
+    with caplog.at_level(logging.WARNING):
+        found = register(tiny_pair.reference, tiny_pair.loaded, bone=bone, settings=Settings(weights))
+    assert "may be mirrored" in found.bone_doubt
+    assert found.bone_doubt in caplog.text
+    subject = Subject(tiny_pair.reference, bone, found.tissue)
+    verdict = Measurement.from_registration(found, subject, Evidence()).verdict
+    assert verdict.level != "trust"
+    assert found.bone_doubt in verdict.reasons
