@@ -221,7 +221,13 @@ def write_state(path: Path | str, mesh: TetMesh, state: LoadState, materials: Ma
 
 
 def read_state(path: Path) -> tuple[meshio.Mesh, FloatArray, FloatArray, FloatArray]:
-    """Read a file of `write_state`: mesh, displacement (n, 3) mm, H = F - I (m, 3, 3), mean pressure (m,) MPa."""
-    read = meshio.read(path)
+    """Read a file of `write_state`: mesh, displacement (n, 3) mm, H = F - I (m, 3, 3), mean pressure (m,) MPa.
+
+    ValueError or KeyError for anything else.
+    """
+    try:
+        read = meshio.vtu.read(path)
+    except Exception as damage:  # what meshio raises depends on the byte that is wrong
+        raise ValueError(f"{path.name}: {type(damage).__name__}: {damage}") from damage
     cells = {name: blocks[0] for name, blocks in read.cell_data.items()}
     return read, read.point_data["displacement_mm"], cells["F"].reshape(-1, 3, 3) - np.eye(3), cells["pressure_mpa"]

@@ -165,6 +165,17 @@ def test_notes_of_earlier_versions_are_shown_once(unreached: fe.Simulation, tmp_
     assert notes == ("weak has no material for tendon; that of fat is used.", *unreached.notes)
 
 
+def test_a_damaged_file_is_refused_by_its_name(simulation: fe.Simulation, tmp_path: Path) -> None:
+    simulation.write(tmp_path)
+    place = tmp_path / "pressed.vtu"
+    whole = place.read_bytes()
+    end = whole.rindex(b"</DataArray>") - 40
+    for damaged in (whole[:end] + whole[end + 8 :], whole[: len(whole) // 2], b""):
+        place.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"a file in it is damaged \(ValueError: pressed\.vtu: "):
+            fe.Simulation.read(tmp_path)
+
+
 def test_folders_are_made_and_names_taken_as_text(simulation: fe.Simulation, tmp_path: Path) -> None:
     simulation.write(tmp_path / "a" / "b", fields=False)
     simulation.write_decks(str(tmp_path / "decks"))
