@@ -3,6 +3,7 @@
 #   make demo    set-up, then the demonstration: a phantom heel through a whole study, a report in ./demo
 #   make test    set-up, then lint, types, import contract and the tests
 #   make test-all  the same with the tests that need full-size images or minutes
+#   make fuzz    every reader of files on damaged copies of small valid ones, a minute each (SECONDS=10 make fuzz)
 #   make setup   only the environment in .venv, redone when requirements.lock or pyproject.toml changes
 #   make lint    ruff, mypy and the import contract
 #   make format  rewrite the sources as ruff formats them
@@ -18,6 +19,8 @@
 PYTHON ?= $(shell for name in python3 python3.13 python3.12 python3.11; do \
 	if $$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; \
 	then echo $$name; break; fi; done)
+SECONDS ?= 60
+SEED ?= 1
 UV ?= uv
 UPGRADE ?=
 VENV := .venv
@@ -29,15 +32,15 @@ BIN := $(VENV)/bin
 endif
 
 # Both cores to the end: a worker that has nothing left takes tests from the other, and each computes on one thread.
-PYTEST := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=2 \
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=2
+PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all short-tests all-tests lint format lock docs peers clean
+.PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock docs peers clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,15p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,16p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -68,6 +71,9 @@ short-tests: setup
 
 all-tests: setup
 	$(PYTEST)
+
+fuzz: setup
+	$(THREADS) $(BIN)/python -m tests.fuzz --seconds $(SECONDS) --seed $(SEED)
 
 lint: setup
 	$(BIN)/ruff check .
