@@ -136,7 +136,7 @@ def _write_itk_transforms(folder: Path) -> None:
 
 
 def _write_interface_spline(folder: Path) -> None:
-    tissues = np.repeat([1, 2], 6)[:, None, None] * np.ones((12, 12, 12), dtype=int)
+    tissues = np.repeat([0, 1], 6)[:, None, None] * np.ones((12, 12, 12), dtype=int)
     interfaces = Interfaces.between(dvc.Grid((12, 12, 12), (2.0,) * 3, (-11.0,) * 3), tissues, 0, 6.0)
     write_interface_spline(folder / "a.npz", InterfaceSpline(SPLINE, SPLINE, interfaces))
 

@@ -42,6 +42,8 @@ def read_interface_spline(path: Path | str) -> InterfaceSpline:
             raise ValueError(f"interfaces were located with {file['numbers']}, now with {NUMBERS}; register again")
         control = _grid(file["control"])
         own = frozen(file["own"], np.int64)
+        if own.min() < 0 or own.max() >= own.size or not np.bincount(own.ravel()).all():
+            raise ValueError("tissues are not numbered from 0 on without gaps")
         borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
         return InterfaceSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
     except (OSError, ValueError, KeyError, TypeError, MrstrainError) as failure:

@@ -201,6 +201,15 @@ def test_a_damaged_file_is_refused(spline, tmp_path):
             read_interface_spline(path)
 
 
+@pytest.mark.parametrize("number", [-1, 5, 12589])  # a depth for each tissue up to the highest takes forever
+def test_a_file_whose_tissues_are_not_numbered_one_after_the_other_is_refused(spline, borders, tmp_path, number):
+    own = borders.own.copy()
+    own[0, 0, 0] = number
+    write_interface_spline(tmp_path / "first.npz", replace(spline, borders=replace(borders, own=own)))
+    with pytest.raises(InputError, match=r"first\.npz: .*not numbered from 0 on without gaps"):
+        read_interface_spline(tmp_path / "first.npz")
+
+
 def test_what_does_not_fit_together_is_refused(spline, borders):
     other = control_grid(GRID, np.full(3, 5.0))
     with pytest.raises(GeometryError, match="the same control grid"):
