@@ -77,6 +77,8 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
         region: from_vector(law["law"], np.array(law["vector_mpa"]), law["bulk_modulus_mpa"])
         for region, law in given["laws"].items()
     }
+    if unlike := sorted(set(materials) ^ set(mesh.regions)):
+        raise ValueError(f"only the mesh or only the materials have the region {', '.join(unlike)}")
     of_loads = tuple(f"{name}{word}" for name in loads for word in (":", " was not tried"))  # derived anew, not remarks
     material_set = MaterialSet(given["set"], given["title"], given["source"], materials)
     return {

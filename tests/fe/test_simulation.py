@@ -176,6 +176,16 @@ def test_a_damaged_file_is_refused_by_its_name(simulation: fe.Simulation, tmp_pa
             fe.Simulation.read(tmp_path)
 
 
+@pytest.mark.parametrize("lost", ["region_numbers_in_vtu", "laws"])
+def test_a_record_that_lacks_a_region_is_refused(simulation: fe.Simulation, tmp_path: Path, lost: str) -> None:
+    simulation.write(tmp_path)
+    record = json.loads((tmp_path / "simulation.json").read_text())
+    record["parameters"][lost].popitem()
+    (tmp_path / "simulation.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"only the mesh or only the materials have the region (fat|skin)"):
+        fe.Simulation.read(tmp_path)
+
+
 def test_folders_are_made_and_names_taken_as_text(simulation: fe.Simulation, tmp_path: Path) -> None:
     simulation.write(tmp_path / "a" / "b", fields=False)
     simulation.write_decks(str(tmp_path / "decks"))
