@@ -34,7 +34,7 @@ def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     """The arguments of a `fe.Simulation`, read from its folder."""
     try:
         return _parts(place, mesh)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as failure:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, StopIteration) as failure:
         raise InputError(
             f"{place}: not the folder of a simulation, or a file in it is damaged ({type(failure).__name__}: "
             f"{failure}). It needs {RECORD}, curve.csv and a VTU file for each load, as written by `mrstrain simulate`."

@@ -186,6 +186,15 @@ def test_a_record_that_lacks_a_region_is_refused(simulation: fe.Simulation, tmp_
         fe.Simulation.read(tmp_path)
 
 
+def test_a_record_of_a_material_that_was_cut_is_refused(simulation: fe.Simulation, tmp_path: Path) -> None:
+    simulation.write(tmp_path)
+    record = json.loads((tmp_path / "simulation.json").read_text())
+    del record["parameters"]["laws"]["fat"]["vector_mpa"][2:]
+    (tmp_path / "simulation.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match="a file in it is damaged"):
+        fe.Simulation.read(tmp_path)
+
+
 def test_folders_are_made_and_names_taken_as_text(simulation: fe.Simulation, tmp_path: Path) -> None:
     simulation.write(tmp_path / "a" / "b", fields=False)
     simulation.write_decks(str(tmp_path / "decks"))
