@@ -24,6 +24,7 @@ from mrstrain.cli.app import app
 from phantoms import (
     Acquisition,
     ShearWave,
+    SyntheticWarp,
     heel_grid,
     labels_of,
     material_points,
@@ -38,7 +39,7 @@ SPACING = 1.6
 
 @pytest.fixture(scope="module")
 def unloaded(heel) -> tuple[Image, Mask]:
-    grid = heel_grid(SPACING)
+    grid = heel_grid(SPACING).part(np.s_[6:-6, 24:, :40])  # the heel and its sole, cut off above and before
     return scan(heel, grid, snr=25.0, number=0), Mask(grid, labels_of(heel, grid).labels > 0)
 
 
@@ -72,21 +73,23 @@ def test_points_are_found_back_through_a_sampled_field() -> None:
     assert np.isnan(material_points(field, np.array([[200.0, 0.0, 0.0]]), np.zeros((1, 3)))).all()
 
 
-@pytest.mark.parametrize("exact", [True, False])
-def test_twin_shows_the_motion(unloaded: tuple[Image, Mask], heel, exact: bool) -> None:
+def sampled(grid: Grid, motion: Composed) -> np.ndarray:
+    return motion.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
+
+
+def test_twin_shows_the_motion(unloaded: tuple[Image, Mask], heel) -> None:
     """Against a scan of the same heel after the same motion: alike where tissue is, unlike without the motion."""
     image, body = unloaded
     motion, foot = under_load(heel, "Load1"), random_foot_motion(2, 1)
     whole = Composed([motion, foot])
-    if exact:
-        made = synthetic_warp(image, body, whole, Acquisition(seed=5), near=foot)
-    else:
-        u = whole.displacement(image.grid.points().reshape(-1, 3)).reshape(*image.grid.shape, 3)
-        made = synthetic_warp(
-            image, body, Within(SampledDisplacement(image.grid, u), body), Acquisition(seed=5), near=foot
-        )
     real = scan(heel, image.grid, motion, foot, snr=None, number=7)
-    inside = real.values > 200.0
+    for given in (whole, Within(SampledDisplacement(image.grid, sampled(image.grid, whole)), body)):
+        shows_the_motion(synthetic_warp(image, body, given, Acquisition(seed=5), near=foot), image, real)
+
+
+def shows_the_motion(made: SyntheticWarp, image: Image, real: Image) -> None:
+    inside, air = real.values > 200.0, real.values[..., :4] <= 200.0
+    inside[:, :8] = inside[..., -8:] = False  # comes from beyond the unloaded image
 
     def alike(values: np.ndarray) -> float:
         return float(np.corrcoef(values[inside], real.values[inside])[0, 1])
@@ -95,9 +98,7 @@ def test_twin_shows_the_motion(unloaded: tuple[Image, Mask], heel, exact: bool) 
     assert made.noise_sd == pytest.approx(27.0, rel=0.05)
     assert alike(made.image.values) > 0.8
     assert alike(image.values) < 0.65
-    air = ~inside
-    air[:, :, 4:] = False
-    assert made.image.values[air].mean() == pytest.approx(made.noise_sd * np.sqrt(np.pi / 2), rel=0.05)
+    assert made.image.values[..., :4][air].mean() == pytest.approx(made.noise_sd * np.sqrt(np.pi / 2), rel=0.05)
 
 
 def test_noise_does_not_move_with_the_tissue(unloaded: tuple[Image, Mask], heel) -> None:
@@ -161,7 +162,7 @@ def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], hee
     bone = labels_of(heel, image.grid).region("bone")
     write_mask(tmp_path / "bone.nii.gz", bone)
     motion, foot = under_load(heel, "Load4"), random_foot_motion(2, 1)
-    u = Composed([motion, foot]).displacement(image.grid.points().reshape(-1, 3)).reshape(*image.grid.shape, 3)
+    u = sampled(image.grid, Composed([motion, foot]))
     write_vectors(tmp_path / "u.nii.gz", image.grid, u.astype(np.float32), ("x", "y", "z"), "u", "LPS", unit="mm")
     given = ["twin", str(tmp_path / "Load0.nii.gz"), str(tmp_path / "u.nii.gz"), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, [*given, "--bone", str(tmp_path / "bone.nii.gz")])
