@@ -70,7 +70,10 @@ def figure_files(stem: Path) -> list[Path]:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """A figure as a PNG file's bytes; equal figures give equal bytes."""
+    """A figure as a PNG file's bytes; equal figures give equal bytes. Its parts keep their places from then on."""
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)  # each file would find the same places again, and draw the figure once more for it
+        figure.set_layout_engine(None)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
     return file.getvalue()
@@ -82,7 +85,6 @@ def _pdf_bytes(figure: Figure) -> bytes:
     Its text is set in a TrueType font that the file holds, its lines are lines, and an image keeps its own voxels: the
     file is small, and as sharp as the data.
     """
-    figure.set_layout_engine("none")  # the places of its parts are known
     for axes in figure.axes:
         for image in axes.images:
             image.set_interpolation("none")

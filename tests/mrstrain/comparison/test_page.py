@@ -14,14 +14,13 @@ from dvc.deformation.protocol import Affine
 from dvc.deformation.strain import plate_axes
 from dvc.images.image import Grid, LabelMap
 from mrstrain.comparison.compare import compare
-from tests.mrstrain.comparison.test_compare import LOADS, given, rows, study, with_errors
+from tests.mrstrain.comparison.test_compare import LOADS, given, rows, with_errors
 from tests.validate.test_comparison import SIDE, case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Field, agreements, compare_load, map_fields, rank_over_loads, skin_displacement
 from validate.agreement import agreement
 from validate.figures import slice_panels
 from validate.report import draw, lowest_bone_point
 
-__all__ = ["study"]
 X = np.array([1.0, 0.0, 0.0])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import meshio
@@ -12,11 +13,9 @@ import pytest
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.trust.verdict import Verdict
 from mrstrain.comparison.compare import Compared, compare
-from tests.mrstrain.comparison.test_compare import given, rows, study, with_errors
+from tests.mrstrain.comparison.test_compare import given, rows, with_errors
 from tests.validate.test_comparison import cube, sheared
 from validate.comparison import verdict_on
-
-__all__ = ["study"]
 
 
 def judged(study: Path, **levels: str) -> None:
@@ -92,8 +91,8 @@ def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(stu
     assert section.verdict.reasons == tuple(others)
 
 
-def test_what_is_refused_leaves_an_earlier_comparison_whole(study: Path) -> None:
-    done(study)
+def test_what_is_refused_leaves_an_earlier_comparison_whole(plain, study: Path) -> None:
+    shutil.copytree(plain.folder / "out", study / "out")
     kept = {p: p.read_bytes() for p in (study / "out").rglob("*") if p.is_file()}
     assert len(kept) > 10
     mesh = cube(4)
