@@ -6,6 +6,7 @@ import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,21 @@ def _heel(**size):
     from phantoms import heel_pair
 
     return heel_pair(3, load=0.6, **size)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tasks of workers run here, one at a time: a process of their own costs three seconds of imports for each."""
+    from dvc.worker import Worker
+
+    here = Lock()
+
+    def run(_: Worker, what: str, task: Callable[..., Any], *given: Any, watch: Callable[[], None] | None = None) -> Any:
+        with here:
+            return task(*given)
+
+    monkeypatch.setattr(Worker, "run", run)
+    monkeypatch.setattr(Worker, "start", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

@@ -23,6 +23,7 @@ from tests.blocks import block
 from tests.fe.test_mesh_names import abaqus, ansys
 from tests.fe.test_simulate import DOWN, FAT, PRESS, block_under_plate, dome, nodal_forces, press
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
 PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]
 MINE = """
 [mine.fat]
