@@ -105,7 +105,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
     here = Lock()
 
-    def run(_: Worker, what: str, task: Callable[..., Any], *given: Any, watch: Callable[[], None] | None = None) -> Any:
+    def run(_: Worker, what: str, task: Callable[..., Any], *given: Any, **_watch: Any) -> Any:
         with here:
             return task(*given)
 

@@ -183,10 +183,10 @@ def test_two_runs_in_one_folder(done):
         run(folder)
 
 
-def without_loads(done: Path, study: Path) -> Path:
-    """A copy of the finished study, in which the loads have still to be registered."""
+def without_loads(done: Path, study: Path, loads: tuple[str, ...] = ("Load1", "Load2")) -> Path:
+    """A copy of the finished study, in which loads have still to be registered."""
     shutil.copytree(done, study)
-    for load in ("Load1", "Load2"):
+    for load in loads:
         (study / "results" / ".study" / f"register {load}.json").unlink()
         shutil.rmtree(study / "results" / "registration" / load)
     return study
@@ -250,7 +250,7 @@ def test_killed_in_any_stage_and_run_again(done, tmp_path, stage):
 def test_a_registration_whose_process_is_killed_is_tried_once_more(done, tmp_path, times):
     """As the system does where memory runs out; killed again, it fails alone and is named."""
     folder, *_ = done
-    study = without_loads(folder, tmp_path / "study")
+    study = without_loads(folder, tmp_path / "study", ("Load1", "Load2")[:times])
     command = [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--workers", "1"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     records = study / "results" / ".study"

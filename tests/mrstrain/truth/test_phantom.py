@@ -20,13 +20,15 @@ from phantoms import Heel, random_foot_motion, under_load
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("phantom")
-    told: list[float] = []
-    make(out, seed=2, loads=("Load1", "Load4"), spacing_mm=(2.0, 2.0, 2.5), progress=lambda _c, _s, f: told.append(f))
-    assert told == sorted(told)
-    assert told[-1] == 1.0
-    return out
+def made(made_once) -> Path:
+    def fill(out: Path) -> None:
+        told: list[float] = []
+        given = {"loads": ("Load1", "Load4"), "spacing_mm": (1.6, 1.6, 3.2)}  # what is scanned lies 1.6 mm apart
+        make(out, seed=2, progress=lambda _c, _s, f: told.append(f), **given)
+        assert told == sorted(told)
+        assert told[-1] == 1.0
+
+    return made_once("phantom", fill)
 
 
 def test_truth_lies_beside_the_images_as_register_writes_it(made: Path) -> None:
@@ -94,7 +96,7 @@ def test_full_disk_is_told_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_command_tells_how_to_register(tmp_path: Path) -> None:
-    given = ["phantom", "--out", str(tmp_path / "p"), "--load", "Load2", "--spacing", "4", "--no-noise"]
+    given = ["phantom", "--out", str(tmp_path / "p"), "--load", "Load2", "--spacing", "3.2", "--no-noise"]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
     assert "mrstrain register" in result.output
