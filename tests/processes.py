@@ -42,7 +42,7 @@ def cluster_of_two(folder: Path) -> Iterator[tuple[str, list[Popen]]]:
     file = folder / "scheduler.json"
 
     def started(command: str, *given: str) -> Popen:
-        asked = [sys.executable, "-m", f"distributed.cli.{command}", "--dashboard-address", ":0", *given]
+        asked = [sys.executable, "-m", f"distributed.cli.{command}", "--dashboard-address", "127.0.0.1:0", *given]
         return Popen([*asked, "--scheduler-file", str(file)], env=environment, stdout=DEVNULL, stderr=DEVNULL)
 
     scheduler = started("dask_scheduler", "--host", "127.0.0.1", "--port", "0")

@@ -107,8 +107,8 @@ def cluster(
         if scheduler is None:
             with (
                 LocalCluster(
-                    n_workers=workers or usable_cores(), threads_per_worker=1, processes=True, dashboard_address=":0",
-                    host="127.0.0.1", silence_logs=50, memory_limit=0,
+                    n_workers=workers or usable_cores(), threads_per_worker=1, processes=True, silence_logs=50,
+                    memory_limit=0, host="127.0.0.1", dashboard_address="127.0.0.1:0",
                 ) as local,
                 Client(local) as client,
             ):  # fmt: skip

@@ -328,6 +328,15 @@ def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path)
         assert kept.result(timeout=60) == "freed arrays serve the next"
 
 
+def test_what_runs_a_study_is_reached_from_this_machine_alone(tmp_path):
+    with cluster(lambda *_: None, [tmp_path], workers=1):
+        family = psutil.Process(), *psutil.Process().children(recursive=True)
+        sockets = [one for process in family for one in process.net_connections("tcp")]
+    listening = [one.laddr.ip for one in sockets if one.status == psutil.CONN_LISTEN]
+    assert len(listening) >= 5  # the scheduler, its page, a nanny, a worker, and the worker's page
+    assert set(listening) == {"127.0.0.1"}
+
+
 def test_a_scheduler_that_is_not_there(images, tmp_path, monkeypatch):
     monkeypatch.setattr("mrstrain.studies.cluster._CONNECT_S", 1.0)
     study = tmp_path / "study"
