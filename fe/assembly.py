@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import sparse
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.compiled import njit
 from dvc.threads import in_parts
 from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values

@@ -18,9 +18,9 @@ has only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, sec
 """
 
 import numpy as np
-from numba import njit
 
 from dvc.arrays import FloatArray
+from dvc.compiled import njit
 
 POLYNOMIAL, HENCKY, OGDEN = 0, 3, 4
 """Positions of C10, of mu_H, and of the first Ogden pair in the parameter vector of a constitutive model."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from dvc.arrays import FloatArray, IntArray
+from dvc.compiled import njit
 from dvc.errors import InputError
 from dvc.threads import in_parts
 from phantoms.bodies import EllipsoidUnion, distance

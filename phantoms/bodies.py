@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numba import njit
 
 from dvc.arrays import FloatArray, frozen
+from dvc.compiled import njit
 from dvc.errors import InputError
 from dvc.threads import in_parts
 from phantoms.compiled import at_point

@@ -1,6 +1,6 @@
 """How functions of one point are compiled."""
 
-from numba import njit
+from dvc.compiled import njit
 
 at_point = njit(cache=True, _nrt=False)
 """Compiles a function that a kernel calls for each of its points, and that makes no array.

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
-from numba import njit
 
 from dvc.arrays import FloatArray, as_points, frozen
+from dvc.compiled import njit
 from dvc.errors import InputError
 from dvc.threads import in_parts
 from phantoms.bodies import EllipsoidUnion

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numba import njit
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
+from dvc.compiled import njit
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid
 from dvc.images.interpolation import Four, Weights, indices_around, spline_basis

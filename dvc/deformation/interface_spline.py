@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
 from scipy.special import ndtri
 
 from dvc import threads
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
+from dvc.compiled import njit
 from dvc.deformation.bspline import BSpline, evaluate_spline, summed_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError

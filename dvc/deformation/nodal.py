@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from dvc.arrays import FloatArray, IntArray, as_points, frozen
+from dvc.compiled import njit
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from dvc.threads import in_parts

@@ -9,9 +9,9 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from dvc.arrays import BoolArray, FloatArray, frozen
+from dvc.compiled import njit
 from dvc.errors import InputError
 from dvc.threads import in_parts
 

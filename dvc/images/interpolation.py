@@ -1,9 +1,9 @@
 """Cubic B-splines and linear interpolation between voxels, compiled: the weights, and values at any index."""
 
 import numpy as np
-from numba import njit
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.compiled import njit
 
 Four = tuple[int, int, int, int]
 """Places of the four coefficients along an axis whose B-splines are not zero at a point."""

@@ -1,11 +1,11 @@
 """Where the body is: a tissue mask made from the image, and masks widened in space."""
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import binary_opening, label
 from skimage.filters import threshold_otsu
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.compiled import njit
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing, smoothed

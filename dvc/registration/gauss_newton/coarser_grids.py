@@ -6,10 +6,10 @@ A cubic B-spline is the sum of five of half its width, so the splines of a coars
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numba import njit
 from scipy.sparse import csr_array
 
 from dvc.arrays import FloatArray
+from dvc.compiled import njit
 from dvc.deformation.bspline import Table
 from dvc.threads import SMALL, in_parts
 

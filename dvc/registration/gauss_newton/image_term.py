@@ -9,10 +9,10 @@ moving image's gradient at places between voxels is correlated with its noise th
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
+from dvc.compiled import njit
 from dvc.deformation.bspline import Table
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import cubic_at

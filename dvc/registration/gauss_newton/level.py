@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, FloatArray
+from dvc.compiled import njit
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import gaussian_filter
 
 from dvc.arrays import FloatArray
+from dvc.compiled import njit
 from dvc.images.image import Grid
 from dvc.registration.gauss_newton.coarser_grids import TWICE_AS_WIDE, coarser
 from dvc.threads import SMALL, in_parts

@@ -7,9 +7,9 @@ takes several numbers at once where a loop counts from zero, over views cut to w
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
 from dvc.arrays import BoolArray, FloatArray
+from dvc.compiled import njit
 from dvc.deformation.bspline import Axis, Table
 
 Stiffness = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
