@@ -24,7 +24,7 @@ from mrstrain.options.door import door
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
 from mrstrain.records.doctor import usable_memory_bytes
-from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
 
@@ -131,13 +131,14 @@ def compare(
         # Every file is read once before anything is removed, and again when needed: together they would fill memory.
         warnings = validate.check_models(cases, tissues, bones, each=each)
         make_output(target)
-        record = provenance("compare", inputs, given)
-        result = validate.compare(
-            cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings, progress=share,
-            each=each,
-        )  # fmt: skip
-        said = methods(folders, of_models, result, criteria)
-        parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
+        with alone(target):
+            record = provenance("compare", inputs, given)
+            result = validate.compare(
+                cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings, progress=share,
+                each=each,
+            )  # fmt: skip
+            said = methods(folders, of_models, result, criteria)
+            parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
     share(1.0)
     return Compared(target, result, *parts, taken)
 

@@ -25,7 +25,14 @@ from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.options.model import Flag
-from mrstrain.records.inputs import case_names, output_folder, read_subject, refuse_small_disk, refuse_touching_inputs
+from mrstrain.records.inputs import (
+    alone,
+    case_names,
+    output_folder,
+    read_subject,
+    refuse_small_disk,
+    refuse_touching_inputs,
+)
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 
@@ -105,7 +112,7 @@ def register(
         record = record_of(subject, files, settings, registration, more)
         plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
         run = _Run(target, plan, images, start, progress or (lambda *_: None))
-        with output_folder(target):
+        with output_folder(target), alone(target):
             run.all(at_once, registration.chain, first)
             finished = run.finished()
     return Series.of(target, finished, run.failures, record)

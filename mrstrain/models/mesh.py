@@ -11,7 +11,7 @@ from dvc.report.drawing import ENDINGS, save_figure
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
 from mrstrain.options.modelling import Labelling, Meshing
-from mrstrain.records.inputs import output_folder
+from mrstrain.records.inputs import alone, output_folder
 from mrstrain.records.provenance import provenance
 
 _CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0
@@ -90,7 +90,7 @@ def mesh(
         if path.resolve() in [target.resolve(), *written]:
             raise OutputError(f"{path} is an input and would be overwritten. Choose another output file (out).")
     given = read_labels(labels, labelling.names)
-    with output_folder(target.parent):
+    with output_folder(target.parent), alone(target, target.with_name(f".{target.name}.lock")):
         how = meshing.model_dump()
         made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch or (lambda _: None))
         del how["limit_s"]  # does not affect the mesh

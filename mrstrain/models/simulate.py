@@ -4,7 +4,8 @@ import re
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 
 import fe
 from dvc.atomic_files import remove_partial, write_whole
-from dvc.errors import InputError, MrstrainError, OutputError
+from dvc.errors import InputError, MrstrainError, OutputError, WorkerError
 from dvc.own_files import read_json
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
@@ -21,7 +22,7 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
-from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
@@ -83,6 +84,8 @@ def simulate(
     ------
     InputError
         If the mesh, a material set or a load cannot be used; before anything is computed.
+    MrstrainError
+        If every simulation failed; `WorkerError` if their processes died.
     """
     place, target, tell = Path(mesh), Path(out), progress or (lambda *_: None)
     sets, limit_s, decks = simulation.sets, simulation.limit_s, simulation.decks
@@ -105,13 +108,6 @@ def simulate(
         tell(NOTE, note, 0.0)
     refuse_touching_inputs(target, [one.name for one in chosen], [place])
     make_output(target)
-    for folder in (target / one.name for one in chosen):
-        make_output(folder)
-        fe.clear_simulation(folder)
-        remove_partial(folder)
-        for left in folder.glob(f"*{ENDING}"):  # checkpoints of the current loads are kept
-            if left.name.removesuffix(ENDING) not in plates:
-                left.unlink()
     beside = [names] if (names := place.with_suffix(".json")).is_file() else []
     files = {"mesh": [place, *beside], "sets": [Path(s) for s in sets if s.endswith(".toml")]}
     given = coordinates.plain() | contact | {"fixed": list(held), "limit_s": limit_s, "mesh_made": _mesh_made(place)}
@@ -119,10 +115,25 @@ def simulate(
     each = cores.threads or max(1, usable_cores() // at_once)
     options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
     run = _Run(target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
-    each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
+    with ExitStack() as held_folders:
+        for folder in (target / one.name for one in chosen):
+            make_output(folder)
+            held_folders.enter_context(alone(folder))
+            _remove_earlier(folder, plates)
+        each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
-        raise MrstrainError(with_reasons("Every simulation failed.", [f"{n}: {r}" for n, r in run.failures.items()]))
+        kind = WorkerError if run.died == run.failures.keys() else MrstrainError
+        raise kind(with_reasons("Every simulation failed.", [f"{n}: {r}" for n, r in run.failures.items()]))
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
+
+
+def _remove_earlier(folder: Path, loads: Collection[str]) -> None:
+    """Remove the results of an earlier simulation; checkpoints of the current loads are kept."""
+    fe.clear_simulation(folder)
+    remove_partial(folder)
+    for left in folder.glob(f"*{ENDING}"):
+        if left.name.removesuffix(ENDING) not in loads:
+            left.unlink()
 
 
 def load_named(text: str) -> fe.LoadStep:
@@ -173,6 +184,7 @@ class _Run:
     progress: OnProgress
     done: dict[str, fe.Simulation] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
+    died: set[str] = field(default_factory=set)  # those of them whose process died
     ended: dict[int, list[fe.LoadState]] = field(default_factory=dict)
     writing: threading.Lock = field(default_factory=threading.Lock)
 
@@ -190,6 +202,7 @@ class _Run:
                 states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
             except MrstrainError as failure:
                 states, self.failures[case] = [], str(failure)
+                self.died.update({case} if isinstance(failure, WorkerError) else ())
         with self.writing:
             self.ended[id(problem)] = states
             problems = [one for other, one in self.jobs if other is chosen]

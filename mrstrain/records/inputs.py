@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from dvc import Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
 from dvc.arrays import FloatArray
@@ -16,6 +17,7 @@ from dvc.io.result_folder import REPORT
 from dvc.measurement.subject import plate_directions
 from mrstrain.options.measurement import MeshAndAxes, SubjectFiles
 
+_LOCK = ".mrstrain-lock"
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 
 
@@ -119,6 +121,27 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") ->
 
 
 @contextmanager
+def alone(out: Path, lock: Path | None = None) -> Iterator[None]:
+    """Refuse what another run writes to at the same time: OutputError that names ``out``.
+
+    The ``lock`` is a file, by default in the folder ``out``, that is removed with the block. The operating system
+    releases it when the process ends, even by a kill.
+    """
+    place = lock or out / _LOCK
+    held = FileLock(place)
+    try:
+        held.acquire(timeout=0)
+    except Timeout as taken:
+        raise OutputError(f"{out}: another run writes to it. Wait until it ends, or choose another (out).") from taken
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # where an open file cannot be removed
+            place.unlink()
+        held.release()
+
+
+@contextmanager
 def output_folder(out: Path) -> Iterator[None]:
     """Make the output folder as `make_output` does; where an error ends the block, folders made and left empty go."""
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
@@ -137,10 +160,12 @@ def make_output(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".mrstrain-probe"
-        probe.write_bytes(b"0")
-        probe.unlink(missing_ok=True)  # another run may have probed at the same time
+        try:
+            probe.write_bytes(b"0")
+        finally:
+            probe.unlink(missing_ok=True)  # another run may have probed at the same time
     except OSError as error:
         raise OutputError(
-            f"{out}: results cannot be written here ({error.strerror or error}). Choose another folder (out), or "
-            "change its permissions."
+            f"{out}: results cannot be written here ({error.strerror or error}). Choose another folder (out), "
+            "change its permissions, or free disk space."
         ) from error

@@ -3,19 +3,17 @@
 import logging
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from dvc import Verdict
-from dvc.errors import InputError, OutputError, ParameterError
+from dvc.errors import InputError, ParameterError
 from dvc.io.result_folder import REPORT
 from dvc.threads import usable_cores
-from mrstrain.records.inputs import make_output, refuse_small_disk
+from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
 from mrstrain.studies.costs import CARE, costs, disk_bytes, expected, sizes_of
@@ -232,23 +230,14 @@ def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence
 
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """Lock the results folder; the operating system releases it when the process ends, even by a kill."""
+    """Make the results folder, and refuse it while another run writes to it."""
     make_output(out)
     make_output(out / ".study")
-    lock = FileLock(out / ".study" / "lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as taken:
-        raise OutputError(
-            f"{out}: another run uses this folder. Wait until it ends, or choose another results folder ([study] out)."
-        ) from taken
-    try:
+    with alone(out, out / ".study" / "lock"):
         yield
-    finally:
-        lock.release()
 
 
 def _log(path: Path, text: str) -> None:
-    """Append a line with the current time to a file."""
-    with path.open("a", encoding="utf-8") as file:
+    """Append a line with the current time to a file; a line that a full disk does not take does not stop the run."""
+    with suppress(OSError), path.open("a", encoding="utf-8") as file:
         file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S}Z {text}\n")

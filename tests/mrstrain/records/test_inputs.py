@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvc.errors import InputError, MrstrainError
+from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.images.image import Grid, Image
 from dvc.io.images.write import write_image
 from mrstrain.measurement.register import register
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import (
+    alone,
     case_names,
     make_output,
     read_matrix,
@@ -39,6 +40,25 @@ def test_arguments_are_named_without_the_dashes_of_the_command_line(tmp_path: Pa
         with pytest.raises(MrstrainError, match=names) as told:
             refused()
         assert "--" not in re.sub(r"\(--.*?\)", "", str(told.value))
+
+
+def test_a_full_disk_is_named_and_keeps_no_probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, _: bytes) -> None:
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OutputError, match=r"No space left on device.*free disk space"):
+        make_output(tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_two_runs_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    with alone(tmp_path), pytest.raises(OutputError, match="another run writes to it"), alone(tmp_path):
+        pass
+    with alone(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_a_bone_three_lines_tell_how_to_get_one(tmp_path: Path) -> None:
