@@ -21,6 +21,8 @@ _I = TypeVar("_I")
 Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """`map`, or one that computes in several processes: a task and items, both picklable, give results in their order."""
 
+TOO_LITTLE_MEMORY = "Free memory, use fewer --workers, crop the images, or use a coarser mesh."
+"""What to do where memory ran out."""
 _POLL_S = 0.5
 _UNWIND_S = 5.0  # for threads to end after an error or interrupt
 _MEMORY = {
@@ -58,6 +60,8 @@ class Worker(AbstractContextManager["Worker", None]):
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
         """Run ``task(*args)`` in the child; its exceptions are raised here, and `WorkerError` if the child dies.
 
+        A child whose memory runs out counts as one that died.
+
         ``what`` is the task in words ("registering Load1"); ``watch`` is called about twice a second meanwhile.
         """
         with self._lock:
@@ -73,6 +77,8 @@ class Worker(AbstractContextManager["Worker", None]):
             try:
                 future = executor.submit(task, *args)
                 return _result(future, watched)  # type: ignore[no-any-return]
+            except MemoryError as lack:
+                raise WorkerError(f"The memory ran out while {what} ({lack}). {TOO_LITTLE_MEMORY}") from lack
             except (TerminatedWorkerError, ShutdownExecutorError) as died:
                 executor.shutdown(wait=False, kill_workers=True)
                 self._executor = None

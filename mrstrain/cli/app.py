@@ -107,9 +107,13 @@ def main() -> None:
     except Exception as error:
         from dvc.errors import MrstrainError
 
-        if not isinstance(error, MrstrainError):
+        if isinstance(error, MrstrainError):
+            _stop(str(error))
+        from mrstrain.records.outcome import lack_of_machine
+
+        if not (lack := lack_of_machine(error)):
             raise
-        _stop(str(error))
+        _stop(lack)
     except SystemExit as ended:
         if ended.code in _TOLD_TO_END:  # threads that still compute would be waited for
             atexit._run_exitfuncs()

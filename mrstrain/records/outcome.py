@@ -1,8 +1,14 @@
 """What a function that leaves files has to tell of them."""
 
+import errno
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from dvc.worker import TOO_LITTLE_MEMORY
+
+_OF_DISKS = (errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +22,20 @@ class Outcome:
     def summary(self) -> list[str]:
         """A few lines for a person; where to look is the last."""
         return list(self.lines)
+
+
+def lack_of_machine(failure: BaseException) -> str:
+    """What this machine lacks, in a sentence and what to do, if a failure comes from that; empty for any other.
+
+    >>> lack_of_machine(OSError(28, "No space left on device", "/tmp/a"))
+    '/tmp/a: No space left on device. Free disk space or change the permissions, then run it again.'
+    """
+    if isinstance(failure, MemoryError):
+        return f"The memory ran out ({failure}). {TOO_LITTLE_MEMORY}"
+    if isinstance(failure, OSError) and failure.errno in _OF_DISKS:
+        what = f"{failure.filename or tempfile.gettempdir()}: {failure.strerror}"
+        return f"{what}. Free disk space or change the permissions, then run it again."
+    return ""
 
 
 def with_reasons(what: str, reasons: Sequence[str]) -> str:

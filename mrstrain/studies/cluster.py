@@ -9,8 +9,7 @@ import traceback
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,15 @@ from filelock import FileLock
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.software import software_key
 from dvc.threads import usable_cores
+from mrstrain.records.outcome import lack_of_machine
 from mrstrain.records.progress import OnProgress
 from mrstrain.studies import stages
 from mrstrain.studies.stages import StageResult
 
 _TELL_EVERY_S = 1.0
+_A_FAULT = "This is an error in mrstrain; please report it:\n"
 _TRIED = "This was computed at the second attempt."
+_TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
 _SETTINGS = {
@@ -44,26 +46,46 @@ _SETTINGS = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class _Call:
+    """A stage as a worker gets it."""
+
+    name: str
+    function: str
+    arguments: dict[str, Any]
+    lock: str
+    urgency: float
+    died: str = ""  # how a process of it died at the first attempt
+
+
 class StageRunner:
     """Runs several stages at the same time; made by `cluster`."""
 
     def __init__(self, client: Client, watch: OnProgress) -> None:
         self._client = client
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
-        self._under_way: dict[Future[Any], str] = {}
+        self._under_way: dict[Future[Any], _Call] = {}
+        self._died: list[_Call] = []  # to be tried once more
         self._finished: queue.Queue[Future[Any]] = queue.Queue()
         client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
 
     def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, urgency: float = 0.0) -> None:
         """Queue a stage; it starts when a worker and its lock are free, the most urgent of the waiting stages first."""
-        key = f"{name.replace(' ', '-')}-{uuid.uuid4().hex}"
-        given = self._topic, name, function, dict(arguments), str(lock)
-        future = self._client.submit(_run, *given, key=key, pure=False, priority=urgency)
-        self._under_way[future] = name
+        self._submit(_Call(name, function, dict(arguments), str(lock), urgency))
+
+    def _submit(self, call: _Call) -> None:
+        key = f"{call.name.replace(' ', '-')}-{uuid.uuid4().hex}"
+        future = self._client.submit(_run, self._topic, call, key=key, pure=False, priority=call.urgency)
+        self._under_way[future] = call
         future.add_done_callback(self._finished.put)
 
     def next(self) -> tuple[str, StageResult | str, float]:
-        """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s."""
+        """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s.
+
+        A stage that a process of died is tried once more when no other is under way: its memory may have run out.
+        """
+        if not self._under_way and self._died:
+            self._submit(self._died.pop(0))
         lost_since: float | None = None
         while True:
             try:
@@ -74,13 +96,21 @@ class StageRunner:
                 lost_since = None if left else lost_since or time.monotonic()
                 if lost_since is not None and time.monotonic() - lost_since > _LOST_S:
                     future = next(iter(self._under_way))
-                    return self._under_way.pop(future), "The scheduler, or every worker, has stopped.", 0.0
-        name = self._under_way.pop(future, "")
-        if not name:  # abandoned before
+                    return self._under_way.pop(future).name, "The scheduler, or every worker, has stopped.", 0.0
+        call = self._under_way.pop(future, None)
+        if call is None:  # abandoned before
             return self.next()
+        name = call.name
         if future.status == "finished":
             outcome, seconds = future.result()
-            return name, outcome, seconds
+            if not isinstance(outcome, WorkerError):
+                lines = (f"{_TRIED} {call.died}",) if call.died else ()
+                again = isinstance(outcome, StageResult) and lines
+                return name, replace(outcome, lines=(*outcome.lines, *lines)) if again else outcome, seconds
+            if call.died:
+                return name, f"{outcome} It was tried twice.", seconds
+            self._died.append(replace(call, died=str(outcome)))
+            return self.next()
         error = future.exception() if future.status == "error" else None
         if error is None:
             return name, f"The connection to the scheduler was lost, or it cancelled the stage ({future.status}).", 0.0
@@ -90,7 +120,7 @@ class StageRunner:
     @property
     def busy(self) -> bool:
         """Whether a stage is running or waiting."""
-        return bool(self._under_way)
+        return bool(self._under_way or self._died)
 
 
 @contextmanager
@@ -154,9 +184,10 @@ def _kill_workers(local: LocalCluster) -> None:
             continue
         with suppress(psutil.Error):
             worker = psutil.Process(nanny.pid)
-            for process in (worker, *worker.children(recursive=True)):  # the worker first: it would try a stage again
+            for process in (worker, *worker.children(recursive=True)):  # the worker first: it would begin the next
                 with suppress(psutil.Error):
-                    process.kill()
+                    if not any(_TRACKER in word for word in process.cmdline()):
+                        process.kill()
 
 
 def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
@@ -191,8 +222,8 @@ def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
     return software_key("mrstrain"), multiprocessing.current_process().daemon, seen
 
 
-def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[StageResult | str, float]:
-    """Run a stage in a worker, under its lock, and once more if a process of it dies; errors are returned as text."""
+def _run(topic: str, call: _Call) -> tuple[StageResult | WorkerError | str, float]:
+    """Run a stage in a worker, under its lock; errors are returned, as text unless a process of it died."""
     began, reported = time.monotonic(), -_TELL_EVERY_S
     worker = get_worker()
 
@@ -201,23 +232,20 @@ def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: 
         now = time.monotonic()
         if fraction >= 1.0 or now - reported >= _TELL_EVERY_S:
             reported = now
-            worker.log_event(topic, (name, what, float(fraction)))
+            worker.log_event(topic, (call.name, what, float(fraction)))
 
-    tell("begun", 0.0)
-    stage: Callable[[], StageResult] = partial(getattr(stages, function), tell, **arguments)
-    outcome: StageResult | str
+    tell("once more" if call.died else "begun", 0.0)
+    stage: Callable[..., StageResult] = getattr(stages, call.function)
+    outcome: StageResult | WorkerError | str
     try:
-        with FileLock(lock):
-            try:
-                outcome = stage()
-            except WorkerError as death:
-                tell("once more", 0.0)
-                again = stage()
-                outcome = replace(again, lines=(*again.lines, f"{_TRIED} {death}"))
+        with FileLock(call.lock):
+            outcome = stage(tell, **call.arguments)
     except WorkerError as death:
-        outcome = f"{death} It was tried twice."
+        outcome = WorkerError(str(death))
+    except MemoryError as lack:
+        outcome = WorkerError(lack_of_machine(lack))
     except MrstrainError as error:
         outcome = str(error)
-    except Exception:
-        outcome = "This is an error in mrstrain; please report it:\n" + traceback.format_exc()
+    except Exception as error:
+        outcome = lack_of_machine(error) or _A_FAULT + traceback.format_exc()
     return outcome, time.monotonic() - began

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dvc.atomic_files import write_whole
+from dvc.errors import OutputError
 from dvc.software import software_key
 from mrstrain.records.provenance import file_hash, without_folders
 from mrstrain.studies.plan import Stage
@@ -142,7 +143,7 @@ class Ledger:
     def reason(self, stage: Stage) -> str:
         """The reason why a stage has no result; empty if it was never run."""
         try:
-            return self._file(stage, _REASON).read_text(encoding="utf-8")
+            return self._file(stage, _REASON).read_text(encoding="utf-8", errors="replace")
         except OSError:
             return ""
 
@@ -153,7 +154,9 @@ class Ledger:
     def keep(
         self, stage: Stage, key: str, made_from: Mapping[str, Any], result: StageResult, seconds: float
     ) -> StageRecord:
-        """Record that a stage is finished."""
+        """Record that a stage is finished; OutputError if a result is not there, as its folder was removed."""
+        if lacking := [place for place in stage.gives if not place.exists()]:
+            raise OutputError(f"{lacking[0]}: was removed while the study ran. Run it again.")
         made = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
         files = {p.relative_to(self.out).as_posix(): FileState.of(p) for p in made if p.is_file()}
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

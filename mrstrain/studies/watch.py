@@ -142,6 +142,7 @@ class Watch:
         while not self._stop.wait(_PAGE_EVERY_S):
             with self._lock:
                 changed, self._changed = self._changed, set()
+                self._tell_all()  # stages that hang tell nothing
             self._write(changed)
 
     def _write(self, prefixes: Iterable[str], *, interrupted: bool = False) -> None:

@@ -29,6 +29,17 @@ def _fails() -> None:
     raise RegistrationError("no overlap")
 
 
+def _needs_more_memory_than_there_is() -> None:
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, limits[1]))
+    try:
+        np.ones(2 << 30)  # 16 GiB
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
 def _imports(module: str) -> bool:
     return module in sys.modules
 
@@ -52,6 +63,14 @@ def test_memory_of_a_freed_array_serves_the_next_even_below_a_worker_of_dask(mon
     monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")  # as Dask sets it: 25,600 pages
     with Worker(threads=1) as worker:
         assert worker.run("counting", _pages_of_freed_arrays) < 1000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+def test_memory_that_runs_out_is_named_and_the_next_task_runs():
+    with Worker(threads=1) as worker:
+        with pytest.raises(WorkerError, match=r"memory ran out while registering Load1 \(.*16.*\)\. Free memory"):
+            worker.run("registering Load1", _needs_more_memory_than_there_is)
+        assert worker.run("adding", sum, [1, 2]) == 3
 
 
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])

@@ -68,6 +68,26 @@ def test_a_study_ends_and_goes_on(images, tmp_path, group):
     assert "interrupted" in (study / "results" / "report.html").read_text().lower()
 
 
+def test_a_study_whose_processes_hang_ends_and_leaves_nothing_in_shared_memory(images, tmp_path):
+    study, below = tmp_path / "study", list[psutil.Process]()
+    shutil.copytree(images, study)
+
+    def hangs(process: psutil.Process) -> bool:
+        if begun := under_way(study / "results" / ".study", "register repeat"):
+            wait_for(lambda: any("popen_loky" in " ".join(one.cmdline()) for one in process.children(recursive=True)))
+            below.extend(process.children(recursive=True))
+            for one in below:
+                if "resource_tracker" not in " ".join(one.cmdline()):
+                    one.suspend()
+        return begun
+
+    command = ["run", str(study), "--only", "register repeat", "--workers", "1"]
+    interrupted(command, tmp_path / "err.txt", hangs, group=False)
+    numbers = {str(one.pid) for one in below}
+    shared = [file.name for file in Path("/dev/shm").glob("sem.loky-*") if file.name.split("-")[1] in numbers]
+    assert shared == []
+
+
 @pytest.mark.parametrize("group", [False, True], ids=["process", "group"])
 def test_a_registration_ends(images, tmp_path, group):
     given = [str(images / name) for name in ("Load0.nii.gz", "Load1.nii.gz")]

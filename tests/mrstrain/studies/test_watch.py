@@ -155,3 +155,12 @@ def test_a_browser_opens_once_the_page_has_a_picture_and_not_before(seen: Seen) 
     seen.end("register Load1", MEASURED)
     seen.watch.reports[""].in_progress([], 1.0)
     assert seen.shown == [seen.path]
+
+
+def test_a_run_whose_stages_hang_tells_how_long_it_has_been(seen: Seen) -> None:
+    seen.watch.told("mesh", "meshing", 0.5)
+    told = len(seen.events)
+    with seen.watch.reporting():
+        wait_for(lambda: len(seen.events) > told + 2, limit_s=20.0)
+    assert {case for case, *_ in seen.events[told:]} == {ALL}
+    assert all(0.0 <= fraction < 1.0 for *_, fraction in seen.events[told:])

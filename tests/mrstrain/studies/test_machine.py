@@ -1,0 +1,169 @@
+"""What the machine does to a run: full disks, memory that runs out, folders that go, clocks that are set back."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import time
+from concurrent.futures import Future
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from dvc.errors import InputError, WorkerError
+from mrstrain.studies import cluster, ledger, stages
+from mrstrain.studies.cluster import StageRunner, _Call, _run
+from mrstrain.studies.ledger import Ledger
+from mrstrain.studies.pipeline import Pipeline
+from mrstrain.studies.run import _log
+from mrstrain.studies.stages import StageResult
+from tests.mrstrain.studies import test_pipeline
+from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
+@pytest.mark.parametrize("stage", ALL)
+def test_a_stage_whose_record_a_disk_does_not_take_is_named_and_made_again(folder, monkeypatch, stage, code):
+    rename = os.replace
+
+    def refusing(source: Path, target: Path) -> None:
+        if Path(target).name == f"{stage}.json":
+            raise OSError(code, os.strerror(code))
+        rename(source, target)
+
+    with monkeypatch.context() as full:
+        full.setattr(os, "replace", refusing)
+        _, outcomes, told = ran(folder)
+    assert outcomes[stage].status == "FAILED"
+    assert f"{os.strerror(code)}). Check" in outcomes[stage].reason
+    assert any(line.startswith(f"{stage}: FAILED") and os.strerror(code) in line for line in told)
+    assert not list((folder / "results").rglob(".*partial*"))
+    again, outcomes, _ = ran(folder)
+    assert again[0] == stage
+    assert all(one.complete for one in outcomes.values())
+
+
+def test_a_log_that_a_full_disk_does_not_take_stops_nothing(tmp_path):
+    _log(tmp_path / "gone" / "study.log", "mesh: done")
+
+
+@pytest.mark.parametrize(
+    ("failure", "told"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "/tmp/x"), "/tmp/x: No space left on device. Free disk"),
+        (OSError(errno.EROFS, "Read-only file system"), "Read-only file system. Free disk space or change"),
+        (InputError("Load1.nii.gz: damaged."), "Load1.nii.gz: damaged."),
+        (KeyError("fat"), "This is an error in mrstrain"),
+    ],
+)
+def test_a_failure_of_the_machine_is_no_error_in_mrstrain(tmp_path, monkeypatch, failure, told):
+    assert told in ended_by(failure, tmp_path, monkeypatch)
+
+
+def ended_by(failure: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch) -> object:
+    """What a worker returns of a stage that raises an error."""
+
+    def failing(tell: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(log_event=lambda *_: None))
+    monkeypatch.setattr(stages, "mesh", failing)
+    return _run("topic", _Call("mesh", "mesh", {}, str(folder / "lock"), 0.0))[0]
+
+
+def test_memory_that_runs_out_counts_as_a_process_that_died(tmp_path, monkeypatch):
+    ended = ended_by(MemoryError("Unable to allocate 40 GiB"), tmp_path, monkeypatch)
+    assert isinstance(ended, WorkerError)
+    assert "The memory ran out (Unable to allocate 40 GiB)" in str(ended)
+    assert "fewer --workers" in str(ended)
+
+
+class Machine:
+    """A client of Dask on which each stage ends at once, the hungry ones dead so many times."""
+
+    status = "running"
+
+    def __init__(self, **hungry: int) -> None:
+        self.hungry, self.begun = hungry, list[str]()
+
+    def subscribe_topic(self, *_: object) -> None:
+        pass
+
+    def submit(self, _function: object, _topic: str, call: _Call, **_: object) -> Future:
+        self.begun.append(call.name)
+        self.hungry[call.name] = self.hungry.get(call.name, 0) - 1
+        future = Future()
+        future.status = "finished"
+        dies = self.hungry[call.name] >= 0
+        future.set_result((WorkerError("It died.") if dies else StageResult((f"{call.name} done",)), 1.0))
+        return future
+
+
+@pytest.mark.parametrize("deaths", [1, 2])
+def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path, deaths):
+    machine = Machine(big=deaths)
+    runner = StageRunner(machine, lambda *_: None)
+    for name in ("big", "small", "other"):
+        runner.begin(name, "mesh", {}, tmp_path / "lock")
+    ended = {}
+    while runner.busy:
+        name, outcome, _ = runner.next()
+        ended[name] = outcome
+        if name == "small":
+            runner.begin("next", "mesh", {}, tmp_path / "lock")
+    assert machine.begun == ["big", "small", "other", "next", "big"]
+    assert list(ended) == ["small", "other", "next", "big"]
+    expected = "It died. It was tried twice." if deaths == 2 else "This was computed at the second attempt. It died."
+    assert expected in (ended["big"] if deaths == 2 else ended["big"].lines)
+
+
+def test_results_that_are_removed_under_a_run_are_not_recorded(folder, monkeypatch):
+    class Removing(Here):
+        def next(self) -> tuple[str, StageResult | str, float]:
+            ended = super().next()
+            if ended[0] == "simulate b":
+                shutil.rmtree(folder / "results")
+            return ended
+
+    with monkeypatch.context() as removed:
+        removed.setattr(test_pipeline, "Here", Removing)
+        _, outcomes, _ = ran(folder, failing=("compare",))  # as it finds nothing to read
+    assert outcomes["simulate b"].status == "FAILED"
+    assert "was removed while the study ran" in outcomes["simulate b"].reason
+    assert ran(folder)[0] == ALL
+    assert ran(folder)[0] == []
+
+
+def test_a_reason_that_is_damaged_is_told_as_it_is(folder):
+    ran(folder, failing=("register a",))
+    (folder / "results" / ".study" / "register a.failed.txt").write_bytes(b"It \xff\xfe broke.")
+    pipeline = Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=("mesh",))
+    pipeline.settle()
+    assert "broke" in pipeline.outcomes["register a"].reason
+    assert ran(folder)[0] == ["register a", "compare"]
+
+
+def test_a_clock_that_is_set_back_makes_nothing_anew_and_refuses_nothing(folder, monkeypatch):
+    def at(year: int) -> None:
+        class Clock(datetime):
+            @classmethod
+            def now(cls, tz: object = None) -> datetime:
+                return datetime(year, 1, 1, tzinfo=UTC)
+
+        monkeypatch.setattr(ledger, "datetime", Clock)
+        monkeypatch.setattr(time, "time", lambda: datetime(year, 1, 1, tzinfo=UTC).timestamp())
+
+    at(2040)
+    assert ran(folder)[0] == ALL
+    for file in (folder / "results").iterdir():
+        os.utime(file, (4e9, 4e9)) if file.is_file() else None
+    at(2001)
+    assert ran(folder)[0] == []
+    (folder / "a.txt").write_text("z")
+    os.utime(folder / "a.txt", (1.0, 1.0))
+    assert ran(folder)[0] == ["register a", "compare"]
+    at(2040)
+    assert ran(folder)[0] == []
