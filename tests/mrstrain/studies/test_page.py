@@ -148,6 +148,7 @@ def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_
     ledger = Ledger(study.out, study.place)
     stages = {stage.name: stage for stage in plan(study)}
     for load in ("Load1", "Load2"):
+        (study.out / "registration" / load).mkdir(parents=True)
         ledger.keep(stages[f"register {load}"], "", {}, SOUND, 1.0)
     errors = [TissueError("fat", 10, 0.1, 0.2, 0.0123, 0.002, 0.03, 0.04, 0.05, 0)]
     write_errors(
@@ -199,6 +200,7 @@ def test_only_what_was_asked_for_decides_the_exit(study: Study) -> None:
         arguments = stage.arguments | {"repeat": []} if stage.perhaps else stage.arguments
         arguments = arguments | {name: [] for name in stage.perhaps}
         made_from = ledger.made_from(stage, arguments)
+        (study.out / "registration" / load).mkdir(parents=True)
         ledger.keep(stage, ledger.key(stage, made_from, {}), made_from, SOUND, 1.0)
     told = CliRunner().invoke(app, ["run", str(study.place), "--only", "register"])
     assert told.exit_code == 0, told.output
