@@ -1,0 +1,107 @@
+"""Whether a run that goes on for long holds ever more of the machine: memory, files, threads, temporary files.
+
+    .venv/bin/python -m benchmarks.long_run --work /tmp/long --out benchmarks/results/long_run.json
+
+The stages of a small study (a heel at 2.3 mm, a mesh of 9 mm) run one after another in the Dask worker that a study
+runs in: so many registrations, then so many simulations. Told after every ten, between two stages, is what the process
+tree holds: resident memory, open files, threads, files in the kernel's shared memory that carry the number of one of
+its processes, and files in its folder for temporary files (Linux only).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from dvc.io.images.write import write_image, write_labels
+from mrstrain.records.provenance import versions
+from mrstrain.studies.cluster import StageRunner, cluster
+from mrstrain.studies.file import read_study
+from mrstrain.studies.plan import Stage, plan
+from phantoms import heel_pair
+from tests.mrstrain.studies.conftest import STUDY, coarse
+
+EVERY = 10
+SHARED = Path("/dev/shm")
+
+
+def study_in(folder: Path) -> dict[str, Stage]:
+    """Write the images of a small study and its file; its stages by kind, with the arguments of one of each."""
+    folder.mkdir(parents=True)
+    pair = heel_pair(3, load=0.6, shape=(44, 50, 46), spacing_mm=2.3)
+    fine = heel_pair(3, load=0.6, shape=(64, 72, 68), spacing_mm=1.6)
+    for name, image in (("Load0", pair.reference), ("Load1", pair.loaded), ("Load2", pair.repeat)):
+        write_image(folder / f"{name}.nii.gz", image)
+    write_image(folder / "Load0-again.nii.gz", pair.repeat)
+    write_labels(folder / "tissues.nii.gz", pair.labels)
+    write_labels(folder / "to_mesh.nii.gz", coarse(fine.labels))
+    (folder / "study.toml").write_text(STUDY)
+    return {stage.kind: stage for stage in plan(read_study(folder))}
+
+
+def held() -> dict[str, float]:
+    """What this process and all below it hold."""
+    tree = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    numbers = {str(one.pid) for one in tree}
+    return {
+        "processes": len(tree),
+        "resident_mib": round(sum(one.memory_info().rss for one in tree) / 2**20, 1),
+        "open_files": sum(one.num_fds() for one in tree),
+        "threads": sum(one.num_threads() for one in tree),
+        "shared_memory_files": sum(not numbers.isdisjoint(re.findall(r"\d+", one.name)) for one in SHARED.iterdir()),
+        "temporary_files": sum(1 for _ in Path(tempfile.gettempdir()).rglob("*")),
+    }
+
+
+def repeated(runner: StageRunner, stage: Stage, count: int) -> dict[str, Any]:
+    """Run a stage so many times, from nothing each time; what is held after every ten."""
+    arguments: Mapping[str, Any] = {**stage.arguments, **dict.fromkeys(stage.perhaps, ())}
+    seen, began = [], time.monotonic()
+    for number in range(1, count + 1):
+        for place in stage.gives:
+            shutil.rmtree(place, ignore_errors=True)
+            place.parent.mkdir(parents=True, exist_ok=True)
+        runner.begin(f"{stage.name} {number}", stage.kind, arguments, stage.gives[0].parent / "lock")
+        _, outcome, _ = runner.next()
+        if isinstance(outcome, str):
+            raise SystemExit(f"{stage.name} failed: {outcome}")
+        if number % EVERY == 0:
+            seen.append({"after": number, **held()})
+            print(stage.kind, seen[-1], flush=True)
+    first, last = (seen[0], seen[-1]) if seen else ({}, {})
+    grown = {name: round(last[name] / max(first[name], 1) - 1.0, 4) for name in first if name != "after"}
+    return {"count": count, "seconds": round(time.monotonic() - began, 1), "held": seen, "grown_since_first_ten": grown}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--registrations", type=int, default=60)
+    parser.add_argument("--simulations", type=int, default=40)
+    parser.add_argument("--work", type=Path, required=True, help="made, and filled; must not exist")
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    stages = study_in(given.work)
+    temporary = given.work / "temporary"
+    temporary.mkdir()
+    os.environ["TMPDIR"] = tempfile.tempdir = str(temporary)
+    with cluster(lambda *_: None, [given.work], workers=1) as runner:
+        repeated(runner, stages["mesh"], 1)
+        runs = {
+            "register": repeated(runner, stages["register"], given.registrations),
+            "simulate": repeated(runner, stages["simulate"], given.simulations),
+        }
+    given.out.write_text(json.dumps({"versions": versions(), "runs": runs}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
