@@ -42,6 +42,8 @@ _SETTINGS = {
     # Dask makes glibc return every freed array to the system, which clears its pages again for the next one. That took
     # a fifth of the processor time of a study.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
+    # Semaphores of a worker that was ended are removed by loky's tracker, which need not tell of it.
+    "distributed.nanny.pre-spawn-environ.PYTHONWARNINGS": "ignore:resource_tracker:UserWarning",
     "logging.distributed": "error",
 }
 

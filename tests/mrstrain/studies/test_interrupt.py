@@ -83,6 +83,7 @@ def test_a_study_whose_processes_hang_ends_and_leaves_nothing_in_shared_memory(i
 
     command = ["run", str(study), "--only", "register repeat", "--workers", "1"]
     interrupted(command, tmp_path / "err.txt", hangs, group=False)
+    assert "resource_tracker" not in (tmp_path / "err.txt").read_text()
     numbers = {str(one.pid) for one in below}
     shared = [file.name for file in Path("/dev/shm").glob("sem.loky-*") if file.name.split("-")[1] in numbers]
     assert shared == []
