@@ -23,7 +23,7 @@ from typing import Any
 
 import psutil
 
-from dvc.io.images.write import write_image, write_labels
+from dvc import write_image, write_labels
 from mrstrain.records.provenance import versions
 from mrstrain.studies.cluster import StageRunner, cluster
 from mrstrain.studies.file import read_study
