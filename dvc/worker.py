@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -52,7 +53,7 @@ class Worker(AbstractContextManager["Worker", None]):
         self._lock = threading.Lock()
 
     def start(self, *modules: str) -> None:
-        """Start the child process and let it import modules, while the caller does something else."""
+        """Start the child process, and let it import modules and what their loops need, beside the caller."""
         with self._lock:
             for module in modules:
                 self._running().submit(_imported, module)
@@ -198,6 +199,8 @@ def _result(future: "Future[_T]", watch: Callable[[], None] = lambda: None) -> _
 
 def _imported(module: str) -> None:
     import_module(module)
+    if (compiled := sys.modules.get("dvc.compiled")) is not None:
+        compiled.prepare()
 
 
 def _end_with(parent: int) -> None:

@@ -106,6 +106,12 @@ def test_a_started_worker_has_imported_what_it_was_told_and_is_the_first_to_be_u
         assert not other.run("asking", _imports, "wave")
 
 
+def test_a_started_worker_is_ready_to_run_compiled_loops():
+    with Worker(threads=1) as worker:
+        worker.start("dvc.images.tissue")
+        assert worker.run("asking", _imports, "numba.cpython.setobj")  # which numba imports for its first loop
+
+
 def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():
     worker = Worker(threads=1)
     worker.run("asking", _process)
