@@ -58,8 +58,9 @@ class Plan:
         (found, twin), is_repeat = done, folder.name == REPEAT
         more = Evidence(noise_floor=floor) if is_repeat else replace(self.evidence, noise_floor=floor)
         evidence = replace(more, error_model=self.evidence.error_model, twin=twin)
-        how = {"name": folder.name, "is_repeat": is_repeat}
-        measured = dvc.Measurement.from_registration(found, self.subject, evidence, **how)
+        measured = dvc.Measurement.from_registration(
+            found, self.subject, evidence, name=folder.name, is_repeat=is_repeat, draw=True
+        )
         return Case.of(measured, folder, self.record), measured.quality.noise_floor
 
 
