@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = ROOT / "docs" / "glossary.md"
 PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")
+QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"")  # names as they were, in the changelog
 NOT_FOR_USERS = {"decisions", "api"}  # a record of its time; made from docstrings
 
 
@@ -23,9 +24,11 @@ def forbidden() -> list[str]:
 
 
 def pages() -> Iterator[tuple[str, str]]:
-    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+    folders = (ROOT / "docs", ROOT / "benchmarks")
+    for path in [ROOT / "README.md", *(page for folder in folders for page in sorted(folder.rglob("*.md")))]:
         if path != GLOSSARY and not NOT_FOR_USERS & set(path.parts):
             yield str(path.relative_to(ROOT)), path.read_text()
+    yield "CHANGELOG.md", QUOTED.sub("", (ROOT / "CHANGELOG.md").read_text())
 
 
 def strings() -> Iterator[tuple[str, str]]:
