@@ -64,12 +64,17 @@ def rician(values: Float32Array, sd: float, seed: int) -> Float32Array:
 
 
 def sampled_by(grid: Grid) -> Grid:
-    """Return the grid itself; where voxels are longer than 1.6 mm, one that splits them into equal parts."""
-    parts = np.maximum(1, np.ceil(np.asarray(grid.spacing_mm) / _LARGEST_MM - 1e-9)).astype(int)
-    if (parts == 1).all():
+    """Return the grid itself; along axes whose voxels are longer than 1.6 mm, one of more voxels over the same length.
+
+    Voxels of the two need not lie in one another: waves over the whole length are what is compared.
+    """
+    shape, spacing_mm = np.array(grid.shape), np.asarray(grid.spacing_mm)
+    finer = np.maximum(shape, np.ceil(shape * spacing_mm / _LARGEST_MM - 1e-9)).astype(int)
+    if (finer == shape).all():
         return grid
-    i, j, k = (int(n) for n in np.array(grid.shape) * parts)
-    return Grid((i, j, k), grid.spacing_mm / parts, grid.points_at(0.5 / parts - 0.5), grid.direction)
+    longer = shape / finer  # the new voxel, in old ones
+    i, j, k = (int(n) for n in finer)
+    return Grid((i, j, k), grid.spacing_mm * longer, grid.points_at(0.5 * longer - 0.5), grid.direction)
 
 
 def _octants(signal: Callable[[FloatArray], FloatArray], grid: Grid) -> FloatArray:

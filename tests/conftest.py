@@ -81,21 +81,27 @@ def computed_once(made_once) -> Callable[[str, Callable[[], Any]], Any]:
 
 
 @pytest.fixture(scope="session")
-def small_pair(computed_once):
-    """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
-    return computed_once("small-pair", lambda: _heel(shape=(64, 72, 68), spacing_mm=1.6))
+def heel_pair_once(computed_once) -> Callable[..., Any]:
+    """`phantoms.heel_pair`, which makes each pair once for all tests."""
+    from phantoms import heel_pair
+
+    def pair(seed: int, **given: Any) -> Any:
+        name = " ".join(f"{name} {given[name]}" for name in sorted(given))
+        return computed_once(f"heel {seed} {name}", lambda: heel_pair(seed, **given))
+
+    return pair
 
 
 @pytest.fixture(scope="session")
-def tiny_pair(computed_once):
+def small_pair(heel_pair_once):
+    """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
+    return heel_pair_once(3, load=0.6, shape=(64, 72, 68), spacing_mm=1.6)
+
+
+@pytest.fixture(scope="session")
+def tiny_pair(heel_pair_once):
     """The same at 2.3 mm, the largest voxels whose bias field is found on every other one: where seconds count."""
-    return computed_once("tiny-pair", lambda: _heel(shape=(44, 50, 46), spacing_mm=2.3))
-
-
-def _heel(**size):
-    from phantoms import heel_pair
-
-    return heel_pair(3, load=0.6, **size)
+    return heel_pair_once(3, load=0.6, shape=(44, 50, 46), spacing_mm=2.3)
 
 
 @pytest.fixture

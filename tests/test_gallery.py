@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from matplotlib import pyplot as plt
 
+import phantoms
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLES = sorted((DOCS / "gallery").glob("*.py"))
 SLOW = {"error_bars"}  # error bars need voxels of full size
@@ -18,7 +20,9 @@ MOST_BYTES = 40_000
     "example",
     [pytest.param(one, id=one.stem, marks=[pytest.mark.full_size] * (one.stem in SLOW)) for one in EXAMPLES],
 )
-def test_an_example_draws_its_picture(example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("in_this_process")
+def test_an_example_draws_its_picture(example, tmp_path, monkeypatch, heel_pair_once) -> None:
+    monkeypatch.setattr(phantoms, "heel_pair", heel_pair_once)
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("agg")
     try:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,26 +24,30 @@ def forbidden() -> list[str]:
     return [words.strip() for line in lines for words in line.split(",") if words.strip(" -")]
 
 
-def pages() -> Iterator[tuple[str, str]]:
+@cache
+def pages() -> list[tuple[str, str]]:
     folders = (ROOT / "docs", ROOT / "benchmarks")
-    for path in [ROOT / "README.md", *(page for folder in folders for page in sorted(folder.rglob("*.md")))]:
-        if path != GLOSSARY and not NOT_FOR_USERS & set(path.parts):
-            yield str(path.relative_to(ROOT)), path.read_text()
-    yield "CHANGELOG.md", QUOTED.sub("", (ROOT / "CHANGELOG.md").read_text())
+    paths = [ROOT / "README.md", *(page for folder in folders for page in sorted(folder.rglob("*.md")))]
+    read = [path for path in paths if path != GLOSSARY and not NOT_FOR_USERS & set(path.parts)]
+    changelog = QUOTED.sub("", (ROOT / "CHANGELOG.md").read_text())
+    return [("CHANGELOG.md", changelog), *((str(path.relative_to(ROOT)), path.read_text()) for path in read)]
 
 
-def strings() -> Iterator[tuple[str, str]]:
+@cache
+def strings() -> list[tuple[str, str]]:
     """Every string of the code, docstrings and messages alike, and the templates of pages and files."""
+    texts = []
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                    yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
+                    texts.append((f"{path.relative_to(ROOT)}:{node.lineno}", node.value))
         for path in sorted(p for ending in ("j2", "toml") for p in (ROOT / package).rglob(f"*.{ending}")):
-            yield str(path.relative_to(ROOT)), path.read_text()
+            texts.append((str(path.relative_to(ROOT)), path.read_text()))
+    return texts
 
 
-def found(words: str, texts: Iterator[tuple[str, str]]) -> list[str]:
+def found(words: str, texts: Iterable[tuple[str, str]]) -> list[str]:
     """Where an expression stands, in any case and across line ends."""
     pattern = re.compile(r"\b" + r"\s+".join(map(re.escape, words.split())) + r"\b", re.IGNORECASE)
     return [f"{place}: {match[0]!r}" for place, text in texts for match in pattern.finditer(text)]
@@ -50,8 +55,8 @@ def found(words: str, texts: Iterator[tuple[str, str]]) -> list[str]:
 
 def test_the_glossary_has_its_forbidden_twins() -> None:
     assert {"shading", "told apart", "maximal shear"} <= set(forbidden())
-    assert found("told apart", iter([("here", "A is told\n    apart from B")])) == ["here: 'told\\n    apart'"]
-    assert not found("travel", iter([("here", "travelling")]))
+    assert found("told apart", [("here", "A is told\n    apart from B")]) == ["here: 'told\\n    apart'"]
+    assert not found("travel", [("here", "travelling")])
 
 
 @pytest.mark.parametrize("words", forbidden())

@@ -67,7 +67,7 @@ def test_function_and_array_give_the_same_image(heel: Heel) -> None:
     np.testing.assert_allclose(images[0], images[1], rtol=1e-6, atol=1e-3)
 
 
-@pytest.mark.parametrize("spacing_mm", [(1.6, 1.6, 1.6), (1.0, 1.0, 4.0), (3.2, 3.2, 3.2)])
+@pytest.mark.parametrize("spacing_mm", [(1.6, 1.6, 1.6), (2.3, 2.3, 2.3), (1.0, 1.0, 4.0), (3.2, 3.2, 3.2)])
 def test_partial_volume_is_right_in_large_voxels(
     heel: Heel, spacing_mm: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -82,7 +82,7 @@ def test_partial_volume_is_right_in_large_voxels(
     error, without = (np.sqrt(np.mean((image - true) ** 2)) / true.mean() for image in (made, bare))
     assert error < 0.015
     if max(spacing_mm) > 2.0:
-        assert without > 0.025
+        assert without > 0.017  # .020 at 2.3 mm, .031 and .039 at 4 and 3.2
 
 
 def test_sensitivity_is_smooth_and_bounded() -> None:
