@@ -1,4 +1,4 @@
-"""The plots of docs/benchmarks/README.md, from the result files alone.
+"""The plots of docs/benchmarks/README.md and docs/engines.md, from the result files alone.
 
     .venv/bin/python -m benchmarks.plots
 
@@ -93,6 +93,27 @@ def error() -> Figure:
     return figure
 
 
+def engines() -> Figure:
+    """Error of each engine under every motion: in fat, in fat beside bone, and in skin; labels are right."""
+    figure, axes = panels(3)
+    motions = ("smooth", "sliding", "Load1", "Load3")
+    shown: dict[str, tuple[str, float | None]] = {
+        "fat": ("fat", None), "fat within 1.5 mm of bone": ("fat", 0.0), "skin": ("skin", None)
+    }  # fmt: skip
+    for one, (title, (tissue, to_bone_mm)) in zip(axes, shown.items(), strict=True):
+        for place, (engine, (label, colour)) in enumerate(ENGINES.items()):
+            results, off = Results(RESULTS / "accuracy" / engine), 0 if engine.endswith("borders") else None
+            heights = [
+                results.error(tissue, motions=(motion,), to_bone_mm=to_bone_mm, labels_off=off) for motion in motions
+            ]
+            one.bar(np.arange(len(motions)) + 0.27 * (place - 1), heights, 0.25, color=colour, label=label)
+        one.set(title=title, ylim=(0, 0.1))
+        one.set_xticks(range(len(motions)), motions, fontsize=8)
+    axes[0].set_ylabel("RMSE of the max. shear")
+    axes[0].legend(frameon=False, fontsize=8)
+    return figure
+
+
 def resolution() -> Figure:
     """How much of a sinusoidal shear is recovered over its wavelength."""
     figure, axes = panels(3)
@@ -107,7 +128,7 @@ def resolution() -> Figure:
             one.plot(*zip(*rows, strict=True), "o-", color=colour, label=label)
         one.axhline(0.9, color="k", linewidth=0.6, linestyle=":")
         one.set(title=tissue, xlabel="wavelength, mm", ylim=(0, 1.1))
-    axes[0].set_ylabel("share recovered")
+    axes[0].set_ylabel("fraction recovered")
     axes[2].legend(frameon=False, fontsize=8, loc="lower right")
     return figure
 
@@ -191,7 +212,7 @@ def convergence() -> Figure:
     return figure
 
 
-PLOTS = (peers, error, resolution, areas, registration, elements, convergence)
+PLOTS = (peers, error, engines, resolution, areas, registration, elements, convergence)
 
 
 def main() -> None:

@@ -1,8 +1,9 @@
 """The pictures at the head of the pages, from results of the demonstration and of the tutorials' own tests.
 
     mrstrain demo --out DEMO
+    mrstrain demo --full --out FULL
     python -m pytest tests/test_tutorials.py -o tmp_path_retention_policy=all --basetemp=TUTORIALS
-    python docs/pictures.py DEMO TUTORIALS
+    python docs/pictures.py DEMO FULL TUTORIALS
 
 Pictures of the gallery are made by its examples (docs/gallery.md), those of the benchmarks by benchmarks/plots.py.
 """
@@ -15,6 +16,7 @@ from datetime import datetime
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 from PIL import Image
 
 import dvc
@@ -22,7 +24,7 @@ import fe
 import phantoms
 
 IMAGES = Path(__file__).resolve().parent / "images"
-WIDTH = 900  # pixels
+WIDTH, HEIGHT = 900, 640  # pixels, at most
 
 DEMO = {
     "measure": "registration/Load1/figures/strain.png",
@@ -33,6 +35,7 @@ DEMO = {
 }
 TUTORIALS = {
     "tutorial-register": "test_register0/results/Load1/figures/strain.png",
+    "verdicts": "test_register0/results/Load1/figures/overlay.png",
     "tutorial-validate": "test_validate0/compared/Load1/slices.png",
     "tutorial-material": "test_material0/fit/fit.png",
     "tutorial-cohort": "test_cohort0/cohort/report.html",
@@ -42,10 +45,10 @@ TUTORIALS = {
 }
 
 
-def save(name: str, picture: Image.Image) -> None:
-    """As WebP of at most `WIDTH` pixels."""
+def save(name: str, picture: Image.Image, width: int = WIDTH) -> None:
+    """As WebP, small enough to stand above the fold."""
     picture = picture.convert("RGB")
-    picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
+    picture.thumbnail((width, HEIGHT), Image.Resampling.LANCZOS)
     picture.save(IMAGES / f"{name}.webp", quality=80, method=6)
 
 
@@ -98,6 +101,39 @@ def phantom_scans() -> plt.Figure:
     return figure
 
 
+def motions() -> plt.Figure:
+    """A heel in three states: unloaded, loaded as it was scanned, and with its bone put back."""
+    s, t = np.meshgrid(np.linspace(-1.0, 1.0, 9), np.linspace(-1.0, 1.0, 9))
+    unloaded = np.stack([30.0 * s, 12.0 * t], axis=-1)
+    u = np.stack([3.0 * s * (1.0 - t**2), 3.5 * (1.0 - s**2 / 2.0) * (1.0 - t)], axis=-1)  # none at the bone, above
+    angle = np.radians(8.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    bone = np.stack([np.cos(np.linspace(0.0, np.pi, 60)) * 30.0, 12.0 + 16.0 * np.sin(np.linspace(0.0, np.pi, 60))], -1)
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return points @ turn.T + (4.0, 5.0)
+
+    states = {
+        "unloaded: X": (unloaded, bone),
+        "loaded, as scanned: T(X) = T$_b$(X + u)": (moved(unloaded + u), moved(bone)),
+        "bone put back: X + u(X)": (unloaded + u, bone),
+    }
+    figure, axes = plt.subplots(1, 3, figsize=(9, 2.9), layout="constrained", sharex=True, sharey=True)
+    for one, (title, (tissue, bone_there)) in zip(axes, states.items(), strict=True):
+        one.fill(*bone_there.T, color="#d9dee4", edgecolor="#4f5b69")
+        one.plot(*np.moveaxis(tissue, -1, 0), *np.moveaxis(tissue.transpose(1, 0, 2), -1, 0), color="#d9730d", lw=0.8)
+        one.plot(*tissue[2, 4], "o", color="#0b6e99")
+        one.set(title=title, aspect="equal")
+        one.axis("off")
+    axes[1].fill(*bone.T, facecolor="none", edgecolor="#4f5b69", linestyle=":")
+    axes[2].annotate(
+        "", unloaded[2, 4] + u[2, 4], unloaded[2, 4], arrowprops={"arrowstyle": "->", "color": "#0b6e99"}
+    )  # fmt: skip
+    axes[2].text(*(unloaded[2, 4] + (1.5, -1.0)), "u", color="#0b6e99")
+    axes[0].text(0.0, 18.0, "bone", ha="center")
+    return figure
+
+
 def bed() -> plt.Figure:
     """Tissue on a flat bone on a plate behind it, pressed and pulled upward, as over a sacrum."""
     values = dvc.Grid((16, 9, 16), (2.5, 2.5, 2.5), (0.0, 0.0, 0.0))
@@ -111,14 +147,16 @@ def bed() -> plt.Figure:
 
 def main() -> None:
     """All of them."""
-    demo, tutorials = map(Path, sys.argv[1:])
+    demo, full, tutorials = map(Path, sys.argv[1:])
     for name, path in DEMO.items():
         save(name, opened(demo / "results" / path))
+    save("strain", opened(full / "results" / DEMO["study"]), 1200)
     for name, path in TUTORIALS.items():
         save(name, opened(tutorials / path))
     save("cluster", drawn(timeline(demo / "results" / "study.log")))
     save("phantoms", drawn(phantom_scans()))
     save("other-sites", drawn(bed()))
+    save("theory", drawn(motions()))
 
 
 if __name__ == "__main__":

@@ -7,9 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import dvc.errors
-from mrstrain.cli.app import main, wrapped
+import mrstrain
+from mrstrain.cli.app import app, main
+from mrstrain.cli.lines import wrapped
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")
@@ -158,3 +161,20 @@ def test_an_error_is_printed_in_lines_broken_between_words(
     assert all(len(line) <= 100 or line.lstrip() == f"{place}:" for line in lines)
     assert " ".join(" ".join(lines).split()) == " ".join(f"mrstrain: {' '.join(told)}".split())
     assert [line.startswith("  ") for line in lines[-2:]] == [True, True]
+
+
+def test_results_are_printed_in_lines_broken_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    report = "Report: /data/" + "a-long-name/" * 12 + "report.html"
+    told = ["Load1: Use with care. " + "The bone moves 0.3 mm. " * 10, "  below it: " + "of them " * 20, report]
+
+    class Done:
+        def summary(self) -> list[str]:
+            return told
+
+    monkeypatch.setattr(mrstrain, "strain", type("", (), {"with_options": lambda *_, **__: Done()}))
+    lines = CliRunner().invoke(app, ["strain", "a.nii", "b.nii", "--out", "c"]).output.splitlines()
+    assert lines[-2:] == ["Report:", "  " + report.removeprefix("Report: ")]
+    assert all(len(line) <= 100 for line in lines[:-1])
+    assert " ".join(" ".join(lines).split()) == " ".join(" ".join(told).split())
+    starts = [len(line) - len(line.lstrip()) for line in lines]
+    assert starts == [0, 2, 2, 2, 4, 0, 2]  # what follows a line is indented below it

@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = ROOT / "docs" / "glossary.md"
 PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")
+QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"")  # names as they were, in the changelog
 NOT_FOR_USERS = {"decisions", "api"}  # a record of its time; made from docstrings
 
 
@@ -25,9 +26,11 @@ def forbidden() -> list[str]:
 
 @cache
 def pages() -> list[tuple[str, str]]:
-    paths = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    folders = (ROOT / "docs", ROOT / "benchmarks")
+    paths = [ROOT / "README.md", *(page for folder in folders for page in sorted(folder.rglob("*.md")))]
     read = [path for path in paths if path != GLOSSARY and not NOT_FOR_USERS & set(path.parts)]
-    return [(str(path.relative_to(ROOT)), path.read_text()) for path in read]
+    changelog = QUOTED.sub("", (ROOT / "CHANGELOG.md").read_text())
+    return [("CHANGELOG.md", changelog), *((str(path.relative_to(ROOT)), path.read_text()) for path in read)]
 
 
 @cache

@@ -7,7 +7,6 @@ import logging
 import os
 import signal
 import sys
-import textwrap
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
@@ -16,6 +15,7 @@ from typing import Annotated
 import typer
 
 from mrstrain.cli import measurement, models, studies
+from mrstrain.cli.lines import say, wrapped
 from mrstrain.cli.options import EXAMPLES, Grouped
 
 _GREETING = """\
@@ -26,7 +26,6 @@ mrstrain measures strain inside soft tissue from pairs of MR images, and compare
   mrstrain compare    compare finite-element models with the strain that was measured
 
 mrstrain --help lists all commands, and mrstrain COMMAND --help the options of one."""
-_WIDTH = 100  # of a line of an error
 _M_ARENA_MAX = -8  # of glibc's malloc.h
 _TOLD_TO_END = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit status
 
@@ -80,9 +79,9 @@ def doctor() -> None:
     tried = {"itk-elastix": "dvc.registration.elastix.run", "pytetwild": "fe.meshing", "sparse solver": "fe.linear"}
     findings = examine(trials={what: partial(trial, what, module) for what, module in tried.items()})
     for finding in findings:
-        typer.echo(f"{'ok  ' if finding.ok else 'NOT '} {finding.what}: {finding.detail}")
+        say(f"{'ok  ' if finding.ok else 'NOT '} {finding.what}: {finding.detail}")
         if not finding.ok and finding.advice:
-            typer.echo(f"     {finding.advice}")
+            say(f"     {finding.advice}")
     if not all(f.ok for f in findings):
         raise typer.Exit(1)
 
@@ -138,18 +137,3 @@ def _share_arenas() -> None:
 def _stop(message: str) -> None:
     typer.echo(wrapped(f"mrstrain: {message}"), err=True)
     sys.exit(2)
-
-
-def wrapped(message: str) -> str:
-    """A message in lines of at most 100 characters, broken between words; paths and options are kept in one piece.
-
-    Its own lines stay; what one of them is indented by, its continuation is as well.
-    """
-    lines = list[str]()
-    for line in message.splitlines():
-        indent = line[: len(line) - len(line.lstrip())]
-        broken = textwrap.wrap(
-            line, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-        )  # fmt: skip
-        lines += broken or [""]
-    return "\n".join(lines)

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 import mrstrain
+from mrstrain.cli.lines import say
 from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.options.modelling import HeelShape
@@ -120,4 +121,4 @@ def accuracy(
         conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
     motions = motion or (*MOTIONS, *WAVES)
     cases = mrstrain.accuracy_cases(preset or (DEFAULT,), conditions, motions, seed or SEEDS)
-    carry_out(mrstrain.accuracy, out, cases=cases, workers=workers, tell_plan=typer.echo)
+    carry_out(mrstrain.accuracy, out, cases=cases, workers=workers, tell_plan=say)

@@ -12,6 +12,7 @@ import typer
 from pydantic.fields import FieldInfo
 from typer.core import TyperCommand
 
+from mrstrain.cli.lines import say
 from mrstrain.options.door import models_of
 from mrstrain.options.measurement import Frame
 from mrstrain.options.model import Options, bare
@@ -63,7 +64,7 @@ def carry_out(work: Callable[P, Done], *given: P.args, **options: P.kwargs) -> N
 def tell(done: Done) -> None:
     """Print a summary of what was done, and end with status 1 where it is not complete."""
     for line in done.summary():
-        typer.echo(line)
+        say(line)
     if not getattr(done, "complete", True):
         raise typer.Exit(1)
 

@@ -9,6 +9,7 @@ import typer
 
 import mrstrain
 from mrstrain.cli.browser import can_open, show
+from mrstrain.cli.lines import say
 from mrstrain.cli.options import Done, Out, P, Workers, tell
 
 StudyFile = Annotated[Path, typer.Argument(help="The study file, or its folder.")]
@@ -91,7 +92,7 @@ def run(
     elif dry_run:
         _refuse_idle("--dry-run runs nothing", {name: given[name] for name in ("--scheduler", "--workers")})
         for name, told in forecast(study, only=only or (), force=force or ()).items():
-            typer.echo(f"{name}: {told}")
+            say(f"{name}: {told}")
     else:
         _carry_out(
             mrstrain.run, study, only=only or (), force=force or (), scheduler=scheduler, workers=workers,

@@ -84,7 +84,15 @@ class NewStudy:
         to_fill_in = [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
         todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
         lines += [f"Study file: {self.path}.{todo}", *to_fill_in, f"Next step: mrstrain check {self.path.parent}"]
+        lines += [] if found.labels or not found.loads else [self._measured_without_labels()]
         return [*lines, f"Picture of what was found: {self.picture}"]
+
+    def _measured_without_labels(self) -> str:
+        """How to measure where the study has no label map."""
+        at = [self.path.parent / name for name in (self.inputs.load0 or "Load0.nii.gz", *self.inputs.loads.values())]
+        bone = self.path.parent / self.inputs.bone_mask if self.inputs.bone_mask else "BONE.nii.gz"
+        command = f"mrstrain register {' '.join(map(str, at))} --bone {bone} --out {self.path.parent / 'results'}"
+        return f"Without a label map, a mask of the bone is enough to measure: {command}"
 
 
 Ask = Callable[[StudyInputs, Sequence[str], Path | str], Answers]

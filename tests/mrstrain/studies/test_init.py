@@ -22,8 +22,10 @@ from dvc.io.images.write import write_image, write_labels, write_mask
 from mrstrain.cli.questions import ask
 from mrstrain.studies.check import check
 from mrstrain.studies.file import Load, Study, keys_of, read_study
-from mrstrain.studies.init import NewStudy, init
+from mrstrain.studies.init import NewStudy, StudyInputs, init
 from mrstrain.studies.picture import Labelled
+
+LABELLED = StudyInputs(load0="Load0.nii.gz", loads={"Load1": "Load1.nii.gz"}, labels="tissues.nii.gz")
 
 
 def folder_of(place: Path, *names: str) -> Path:
@@ -60,6 +62,15 @@ def test_what_has_no_role_is_told_and_stands_in_the_study_file(tmp_path):
 def test_two_unloaded_images_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"both Load0\.nii\.gz and unloaded\.nii\.gz"):
         init(folder_of(tmp_path, "Load0.nii.gz", "unloaded.nii.gz"))
+
+
+@pytest.mark.parametrize(("mask", "bone"), [((), "BONE.nii.gz"), (("calcaneus.nii.gz",), "{}/calcaneus.nii.gz")])
+def test_without_a_label_map_it_says_how_to_measure_all_the_same(tmp_path, mask, bone):
+    told = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "Load2.nii.gz", *mask)).summary()
+    images = " ".join(f"{tmp_path}/Load{n}.nii.gz" for n in range(3))
+    command = f"mrstrain register {images} --bone {bone.format(tmp_path)} --out {tmp_path}/results"
+    assert f"Without a label map, a mask of the bone is enough to measure: {command}" in told
+    assert not any("Without a label map" in line for line in NewStudy(tmp_path / "study.toml", LABELLED, "").summary())
 
 
 def tables_of(text: str) -> dict[str, dict[str, str]]:

@@ -1,0 +1,48 @@
+"""What a reader meets first: a short README, and a picture at the head of every page that explains something."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+LOOKED_UP = {"api", "reference", "decisions", "glossary.md", "changelog.md", "reliability.md"}  # not read from the top
+RECORDS = {"record.md", "gauss-newton.md", "finite-elements.md", "heel-mr.md"}  # stand behind the page of plots
+READ = sorted(
+    page for page in DOCS.rglob("*.md") if not (LOOKED_UP | RECORDS) & set(page.relative_to(DOCS).parts)
+)  # fmt: skip
+ABOVE_THE_FOLD = 15  # lines
+PICTURE = re.compile(r"^!\[(.*)\]\((.*)\)$", re.MULTILINE)
+
+
+def prose(text: str) -> list[str]:
+    """The lines of a page without its code, tables and pictures."""
+    lines = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL).splitlines()
+    return [line for line in lines if not line.startswith(("    ", "|", "!["))]
+
+
+def test_the_readme_is_short() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) < 90
+    assert len(PICTURE.findall(text)) == 1
+    assert max(map(len, prose(text))) <= 118  # all lines are wrapped alike
+    (code,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert len(re.findall(r"^(?!import)\S", code, re.MULTILINE)) <= 5
+    header = next(line for line in text.splitlines() if "muscle" in line and line.startswith("|"))
+    assert header.strip("|").count("|") + 1 <= 6
+
+
+@pytest.mark.parametrize("page", READ, ids=lambda page: str(page.relative_to(DOCS)))
+def test_a_page_begins_with_a_picture(page: Path) -> None:
+    head = "\n".join(page.read_text().splitlines()[:ABOVE_THE_FOLD])
+    assert PICTURE.search(head)
+
+
+def test_every_picture_says_what_it_shows() -> None:
+    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
+    told = [(page.name, words) for page in pages for words, _ in PICTURE.findall(page.read_text())]
+    assert len(told) > 40
+    assert not [one for one in told if len(one[1].split()) < 3]
