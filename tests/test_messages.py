@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 import dvc.errors
-from mrstrain.cli.app import main, wrapped
+from mrstrain.cli.app import main
+from mrstrain.cli.wrapping import wrapped
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")

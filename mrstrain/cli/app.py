@@ -7,7 +7,6 @@ import logging
 import os
 import signal
 import sys
-import textwrap
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
@@ -17,6 +16,7 @@ import typer
 
 from mrstrain.cli import measurement, models, studies
 from mrstrain.cli.options import EXAMPLES, Grouped
+from mrstrain.cli.wrapping import wrapped
 
 _GREETING = """\
 mrstrain measures strain inside soft tissue from pairs of MR images, and compares finite-element models with it.
@@ -26,7 +26,6 @@ mrstrain measures strain inside soft tissue from pairs of MR images, and compare
   mrstrain compare    compare finite-element models with the strain that was measured
 
 mrstrain --help lists all commands, and mrstrain COMMAND --help the options of one."""
-_WIDTH = 100  # of a line of an error
 _M_ARENA_MAX = -8  # of glibc's malloc.h
 _TOLD_TO_END = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit status
 
@@ -89,13 +88,6 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point: errors made on purpose are printed as sentences, with exit status 2."""
-    if len(sys.argv) > 1 and not {"--help", "-h"} & set(sys.argv[1:]):
-        from mrstrain.records.doctor import refuse_foreign_packages
-
-        try:
-            refuse_foreign_packages()  # before anything of dvc is imported: it might not be ours
-        except ImportError as error:
-            _stop(str(error))
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     _share_arenas()
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
@@ -138,18 +130,3 @@ def _share_arenas() -> None:
 def _stop(message: str) -> None:
     typer.echo(wrapped(f"mrstrain: {message}"), err=True)
     sys.exit(2)
-
-
-def wrapped(message: str) -> str:
-    """A message in lines of at most 100 characters, broken between words; paths and options are kept in one piece.
-
-    Its own lines stay; what one of them is indented by, its continuation is as well.
-    """
-    lines = list[str]()
-    for line in message.splitlines():
-        indent = line[: len(line) - len(line.lstrip())]
-        broken = textwrap.wrap(
-            line, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-        )  # fmt: skip
-        lines += broken or [""]
-    return "\n".join(lines)
