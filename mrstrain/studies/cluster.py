@@ -22,7 +22,7 @@ from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.software import software_key
 from dvc.threads import usable_cores
 from mrstrain.records.outcome import lack_of_machine
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import NOTE, OnProgress, duration
 from mrstrain.studies import stages
 from mrstrain.studies.stages import StageResult
 
@@ -32,6 +32,11 @@ _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
+_SILENT_S, _SILENT_TIMES = (
+    3600.0,
+    10.0,
+)  # a stage hangs that tells nothing for longer, and than its study takes so often
+_NAME_EVERY_S = 600.0  # a stage that tells nothing
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts its own processes
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
@@ -56,35 +61,50 @@ class _Call:
     function: str
     arguments: dict[str, Any]
     lock: str
-    urgency: float
+    to_end_s: float  # expected, from its start to the end of the study
     died: str = ""  # how a process of it died at the first attempt
+
+    @property
+    def may_be_silent_s(self) -> float:
+        """How long it may tell nothing before it is taken to hang, seconds."""
+        return max(_SILENT_S, _SILENT_TIMES * self.to_end_s)
 
 
 class StageRunner:
     """Runs several stages at the same time; made by `cluster`."""
 
     def __init__(self, client: Client, watch: OnProgress) -> None:
-        self._client = client
+        self._client, self._watch = client, watch
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
         self._finished: queue.Queue[Future[Any]] = queue.Queue()
-        client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
+        # Of each stage that has begun, for how long no news came while it was looked for; not while the machine sleeps.
+        self._silent_s: dict[str, float] = {}
+        client.subscribe_topic(self._topic, lambda event: self._tell(*event[1]))
 
-    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, urgency: float = 0.0) -> None:
-        """Queue a stage; it starts when a worker and its lock are free, the most urgent of the waiting stages first."""
-        self._submit(_Call(name, function, dict(arguments), str(lock), urgency))
+    def _tell(self, name: str, what: str, fraction: float) -> None:
+        self._silent_s[name] = 0.0
+        self._watch(name, what, fraction)
+
+    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, to_end_s: float = 0.0) -> None:
+        """Queue a stage; it starts when a worker and its lock are free.
+
+        Of the waiting stages, that one is first from whose start the study is expected to take the most seconds.
+        """
+        self._submit(_Call(name, function, dict(arguments), str(lock), to_end_s))
 
     def _submit(self, call: _Call) -> None:
         key = f"{call.name.replace(' ', '-')}-{uuid.uuid4().hex}"
-        future = self._client.submit(_run, self._topic, call, key=key, pure=False, priority=call.urgency)
+        future = self._client.submit(_run, self._topic, call, key=key, pure=False, priority=call.to_end_s)
         self._under_way[future] = call
         future.add_done_callback(self._finished.put)
 
     def next(self) -> tuple[str, StageResult | str, float]:
         """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s.
 
-        A stage that a process of died is tried once more when no other is under way: its memory may have run out.
+        A stage that a process of died is tried once more when no other is under way: its memory may have run out. One
+        that hangs is ended.
         """
         if not self._under_way and self._died:
             self._submit(self._died.pop(0))
@@ -99,10 +119,13 @@ class StageRunner:
                 if lost_since is not None and time.monotonic() - lost_since > _LOST_S:
                     future = next(iter(self._under_way))
                     return self._under_way.pop(future).name, "The scheduler, or every worker, has stopped.", 0.0
+                if hung := self._hung():
+                    return self._ended(hung)
         call = self._under_way.pop(future, None)
         if call is None:  # abandoned before
             return self.next()
         name = call.name
+        self._silent_s.pop(name, None)
         if future.status == "finished":
             outcome, seconds = future.result()
             if not isinstance(outcome, WorkerError):
@@ -118,6 +141,45 @@ class StageRunner:
             return name, f"The connection to the scheduler was lost, or it cancelled the stage ({future.status}).", 0.0
         advice = "The usual cause is too little memory: use fewer workers, or machines with more memory."
         return name, f"The worker of this stage stopped more than once ({error}). {advice}", 0.0
+
+    def _hung(self) -> Future[Any] | None:
+        """A stage that has told nothing for too long, if there is one; those that may become one are named."""
+        for future, call in self._under_way.items():
+            if call.name not in self._silent_s:  # it waits for a worker
+                continue
+            before = self._silent_s[call.name]
+            self._silent_s[call.name] = silent_s = before + _LOOK_EVERY_S
+            if silent_s > call.may_be_silent_s:
+                return future
+            if silent_s // _NAME_EVERY_S > before // _NAME_EVERY_S:
+                limit = f"After {duration(call.may_be_silent_s)} it is ended, and the others go on"
+                end = f"{limit}; Ctrl-C ends the run, and finished stages are kept."
+                self._watch(NOTE, f"{call.name} gave no sign of life for {duration(silent_s)}. {end}", 0.0)
+        return None
+
+    def _ended(self, hung: Future[Any]) -> tuple[str, str, float]:
+        """End a stage that hangs with its worker, which is started anew where a nanny watches it.
+
+        What waits for that worker is queued anew: Dask would count the end of the worker against it.
+        """
+        call = self._under_way[hung]
+        silent_s = self._silent_s.pop(call.name)
+        places = {address: {*keys} for address, keys in self._client.processing().items() if hung.key in keys}
+        held = {hung.key}.union(*places.values())
+        cancelled = [future for future in self._under_way if future.key in held]
+        calls = [self._under_way.pop(future) for future in cancelled]
+        self._client.cancel(cancelled)
+        self._client.restart_workers([*places], raise_for_error=False)
+        for waiting in calls:
+            if waiting is not call:
+                self._submit(waiting)
+        return (
+            call.name,
+            f"It gave no sign of life for {duration(silent_s)} and was ended. The usual causes are a network disk that "
+            "does not answer, another run that holds the stage, and a machine that swaps its memory to disk. Run the "
+            "study again; finished stages are kept.",
+            silent_s,
+        )
 
     @property
     def busy(self) -> bool:

@@ -12,8 +12,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from filelock import FileLock
 
 from dvc.errors import InputError, WorkerError
+from mrstrain.records.progress import NOTE
 from mrstrain.studies import cluster, ledger, stages
 from mrstrain.studies.cluster import StageRunner, _Call, _run
 from mrstrain.studies.ledger import Ledger
@@ -22,6 +24,7 @@ from mrstrain.studies.run import _log
 from mrstrain.studies.stages import StageResult
 from tests.mrstrain.studies import test_pipeline
 from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
+from tests.processes import wait_for
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
@@ -118,6 +121,51 @@ def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path
     assert list(ended) == ["small", "other", "next", "big"]
     expected = "It died. It was tried twice." if deaths == 2 else "This was computed at the second attempt. It died."
     assert expected in (ended["big"] if deaths == 2 else ended["big"].lines)
+
+
+def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, monkeypatch):
+    """It waits for a lock that is never free, in a worker that runs the next stage after that."""
+    told = list[tuple[str, str, float]]()
+    monkeypatch.setattr(cluster, "_LOOK_EVERY_S", 0.2)
+    monkeypatch.setattr(cluster, "_SILENT_S", 4.0)
+    monkeypatch.setattr(cluster, "_NAME_EVERY_S", 2.0)
+    with (
+        FileLock(tmp_path / "held"),
+        cluster.cluster(lambda *event: told.append(event), [tmp_path], workers=1) as runner,
+    ):
+        runner.begin("hangs", "mesh", {}, tmp_path / "held", 0.01)
+        runner.begin("next", "no_stage", {}, tmp_path / "lock", 0.0)
+        wait_for(lambda: told)
+        assert told == [("hangs", "begun", 0.0)]
+        (worker,) = runner._client.nthreads()
+        name, outcome, seconds = runner.next()
+        assert (name, round(seconds)) == ("hangs", 4)
+        assert "gave no sign of life for 4 s and was ended" in outcome
+        assert "Run the study again" in outcome
+        ((_, sentence, _),) = [event for event in told if event[0] == NOTE]
+        assert sentence.startswith("hangs gave no sign of life for 2 s. After 4 s it is ended, and the others go on")
+        name, outcome, _ = runner.next()
+        assert name == "next"
+        assert "has no attribute 'no_stage'" in outcome
+        assert worker not in runner._client.nthreads()
+        assert not runner.busy
+
+
+@pytest.mark.parametrize(("to_end_s", "limit_s"), [(0.0, 3600.0), (300.0, 3600.0), (5000.0, 50_000.0)])
+def test_a_long_stage_may_be_silent_for_longer(to_end_s, limit_s):
+    """By what the study is expected to take from it on: a machine that is ten times as slow loses nothing."""
+    assert _Call("mesh", "mesh", {}, "lock", to_end_s).may_be_silent_s == limit_s
+
+
+def test_a_stage_that_tells_something_now_and_then_does_not_hang(tmp_path, monkeypatch):
+    runner = StageRunner(Machine(), lambda *_: None)
+    monkeypatch.setattr(runner._client, "submit", lambda *_, **__: Future())
+    runner.begin("slow", "mesh", {}, tmp_path / "lock")
+    assert runner._hung() is None  # it has not begun
+    for _ in range(3):
+        runner._tell("slow", "meshing", 0.5)
+        assert not any(runner._hung() for _ in range(3600))
+    assert runner._hung() is not None
 
 
 def test_results_that_are_removed_under_a_run_are_not_recorded(folder, monkeypatch):
