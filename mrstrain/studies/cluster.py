@@ -8,7 +8,7 @@ import time
 import traceback
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from filelock import FileLock
 
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.software import software_key
-from dvc.threads import usable_cores
+from dvc.threads import on_one_core, usable_cores
+from dvc.worker import is_lack_of_memory
 from mrstrain.records.outcome import lack_of_machine
 from mrstrain.records.progress import NOTE, OnProgress, duration
 from mrstrain.studies import stages
@@ -32,14 +33,15 @@ _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
-_SILENT_S, _SILENT_TIMES = (
-    3600.0,
-    10.0,
-)  # a stage hangs that tells nothing for longer, and than its study takes so often
+# A stage hangs that tells nothing for this long, and for this many times what the rest of its study should take.
+_SILENT_S, _SILENT_TIMES = 3600.0, 10.0
 _NAME_EVERY_S = 600.0  # a stage that tells nothing
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts its own processes
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
+    # Workers that were not heard of for minutes by the clock would be ended: on a machine that slept, on one that has
+    # too much to do, and when the clock is set. A stage that hangs is noticed by what it tells.
+    "distributed.scheduler.worker-ttl": None,
     "distributed.worker.memory.terminate": False,  # memory is used in those processes
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.spill": False,
@@ -62,6 +64,7 @@ class _Call:
     arguments: dict[str, Any]
     lock: str
     to_end_s: float  # expected, from its start to the end of the study
+    gib: float  # of memory, expected; 0 if not known
     died: str = ""  # how a process of it died at the first attempt
 
     @property
@@ -87,12 +90,16 @@ class StageRunner:
         self._silent_s[name] = 0.0
         self._watch(name, what, fraction)
 
-    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, to_end_s: float = 0.0) -> None:
+    def begin(
+        self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, to_end_s: float = 0.0,
+        gib: float = 0.0,
+    ) -> None:  # fmt: skip
         """Queue a stage; it starts when a worker and its lock are free.
 
-        Of the waiting stages, that one is first from whose start the study is expected to take the most seconds.
+        Of the waiting stages, that one is first from whose start the study is expected to take the most seconds. A
+        stage that fails for lack of memory tells what it is expected to need.
         """
-        self._submit(_Call(name, function, dict(arguments), str(lock), to_end_s))
+        self._submit(_Call(name, function, dict(arguments), str(lock), to_end_s, gib))
 
     def _submit(self, call: _Call) -> None:
         key = f"{call.name.replace(' ', '-')}-{uuid.uuid4().hex}"
@@ -103,8 +110,8 @@ class StageRunner:
     def next(self) -> tuple[str, StageResult | str, float]:
         """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s.
 
-        A stage that a process of died is tried once more when no other is under way: its memory may have run out. One
-        that hangs is ended.
+        A stage that a process of died is tried once more, on one core and when no other is under way: its memory may
+        have run out. One that hangs is ended.
         """
         if not self._under_way and self._died:
             self._submit(self._died.pop(0))
@@ -133,7 +140,8 @@ class StageRunner:
                 again = isinstance(outcome, StageResult) and lines
                 return name, replace(outcome, lines=(*outcome.lines, *lines)) if again else outcome, seconds
             if call.died:
-                return name, f"{outcome} It was tried twice.", seconds
+                needs = f"; by the estimate it needs {call.gib:.1f} GiB of memory" if call.gib else ""
+                return name, f"{outcome} It was tried twice{needs}.", seconds
             self._died.append(replace(call, died=str(outcome)))
             return self.next()
         error = future.exception() if future.status == "error" else None
@@ -199,19 +207,9 @@ def cluster(
     logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have their own log
     with dask.config.set(_SETTINGS):
         if scheduler is None:
-            with (
-                LocalCluster(
-                    n_workers=workers or usable_cores(), threads_per_worker=1, processes=True, silence_logs=50,
-                    memory_limit=0, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-                ) as local,
-                Client(local) as client,
-            ):  # fmt: skip
+            with _of_this_machine(workers or usable_cores()) as client:
                 client.run(_ignore_interrupts)
-                try:
-                    yield StageRunner(client, watch)
-                except BaseException:
-                    _kill_workers(local)
-                    raise
+                yield StageRunner(client, watch)
             return
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
@@ -233,6 +231,27 @@ def cluster(
                 yield runner
             finally:
                 client.cancel(list(runner._under_way))
+
+
+@contextmanager
+def _of_this_machine(workers: int) -> Iterator[Client]:
+    """A cluster of processes of this machine, ended with the block however that ends."""
+    local = LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=True, silence_logs=50, memory_limit=0, host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+    )  # fmt: skip
+    try:
+        with Client(local) as client:
+            try:
+                yield client
+            except BaseException:
+                _kill_workers(local)
+                raise
+    finally:
+        try:
+            local.close()
+        except TimeoutError:  # a worker that lacks memory may not end when it is asked to
+            _kill_workers(local)
 
 
 def _ignore_interrupts() -> None:
@@ -302,14 +321,13 @@ def _run(topic: str, call: _Call) -> tuple[StageResult | WorkerError | str, floa
     stage: Callable[..., StageResult] = getattr(stages, call.function)
     outcome: StageResult | WorkerError | str
     try:
-        with FileLock(call.lock):
+        with FileLock(call.lock), on_one_core() if call.died else nullcontext():
             outcome = stage(tell, **call.arguments)
     except WorkerError as death:
         outcome = WorkerError(str(death))
-    except MemoryError as lack:
-        outcome = WorkerError(lack_of_machine(lack))
     except MrstrainError as error:
         outcome = str(error)
     except Exception as error:
-        outcome = lack_of_machine(error) or _A_FAULT + traceback.format_exc()
+        lack = lack_of_machine(error)
+        outcome = WorkerError(lack) if is_lack_of_memory(error) else lack or _A_FAULT + traceback.format_exc()
     return outcome, time.monotonic() - began

@@ -79,6 +79,7 @@ class Pipeline:
         self._only, self._force = tuple(only), tuple(force)
         self.outcomes: dict[str, StageOutcome] = {}
         self.seconds_to_end: Mapping[str, float] = {}  # by stage; the one with most is started first
+        self.gib: Mapping[str, float] = {}  # of memory that each stage is expected to need
         self._keys: dict[str, tuple[str, Mapping[str, Any]]] = {}
         self._waiting = {stage.name: stage for stage in stages}
 
@@ -179,8 +180,8 @@ class Pipeline:
             except (OSError, MrstrainError) as failure:
                 self.end(stage.name, str(failure), 0.0, log)
                 continue
-            lock, to_end_s = self.ledger.lock(stage), self._to_end_s(stage)
-            runner().begin(prefix + stage.name, stage.kind, arguments, lock, to_end_s)
+            needs = self._to_end_s(stage), self.gib.get(stage.name, 0.0)
+            runner().begin(prefix + stage.name, stage.kind, arguments, self.ledger.lock(stage), *needs)
 
     def end(self, name: str, result: StageResult | str, seconds: float, log: Log) -> None:
         """Record the outcome of a stage that ran on the cluster: its result, or the reason of its failure."""

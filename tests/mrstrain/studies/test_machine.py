@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
+import subprocess
+import sys
 import time
 from concurrent.futures import Future
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +19,7 @@ import pytest
 from filelock import FileLock
 
 from dvc.errors import InputError, WorkerError
+from dvc.threads import usable_cores
 from mrstrain.records.progress import NOTE
 from mrstrain.studies import cluster, ledger, stages
 from mrstrain.studies.cluster import StageRunner, _Call, _run
@@ -25,6 +30,9 @@ from mrstrain.studies.stages import StageResult
 from tests.mrstrain.studies import test_pipeline
 from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
 from tests.processes import wait_for
+
+if sys.platform != "win32":
+    import resource
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
@@ -74,14 +82,58 @@ def ended_by(failure: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(log_event=lambda *_: None))
     monkeypatch.setattr(stages, "mesh", failing)
-    return _run("topic", _Call("mesh", "mesh", {}, str(folder / "lock"), 0.0))[0]
+    return _run("topic", _Call("mesh", "mesh", {}, str(folder / "lock"), 0.0, 0.0))[0]
 
 
-def test_memory_that_runs_out_counts_as_a_process_that_died(tmp_path, monkeypatch):
-    ended = ended_by(MemoryError("Unable to allocate 40 GiB"), tmp_path, monkeypatch)
+@pytest.mark.parametrize(
+    "lack",
+    [
+        MemoryError("Unable to allocate 40 GiB"),
+        ImportError("/lib/_core.so: failed to map segment from shared object"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+        RuntimeError("can't start new thread"),
+    ],
+)
+def test_memory_that_runs_out_counts_as_a_process_that_died(tmp_path, monkeypatch, lack):
+    """Each of these ended a stage of a study whose address space was limited."""
+    ended = ended_by(lack, tmp_path, monkeypatch)
     assert isinstance(ended, WorkerError)
-    assert "The memory ran out (Unable to allocate 40 GiB)" in str(ended)
+    assert f"The memory ran out ({str(lack).removeprefix('/lib/')})" in str(ended)
     assert "fewer --workers" in str(ended)
+
+
+@pytest.mark.parametrize("died", ["", "It died."])
+def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, died):
+    """A comparison, which starts a process for each core, then needs two thirds of its memory on two."""
+    cores = list[int]()
+    monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(log_event=lambda *_: None))
+    monkeypatch.setattr(stages, "compare", lambda tell: cores.append(usable_cores()))
+    _run("topic", _Call("compare", "compare", {}, str(tmp_path / "lock"), 0.0, 0.0, died))
+    assert cores == [1 if died else usable_cores()]
+
+
+@pytest.mark.full_size
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+@pytest.mark.parametrize(("mib", "ends"), [(800, 2), (1120, 1)])
+def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, ends):
+    """Address space for the command itself is lacking, then for the libraries of its stages."""
+    shutil.copytree(images, tmp_path / "study")
+    told = subprocess.run(
+        [sys.executable, "-m", "mrstrain", "run", str(tmp_path / "study"), "--workers", "2"],
+        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_AS, (mib << 20, mib << 20)),
+        capture_output=True, text=True, check=False, timeout=500,
+    )  # fmt: skip
+    said = told.stdout + told.stderr
+    assert told.returncode == ends
+    assert "The memory ran out" in said
+    assert "fewer --workers" in said.replace("\n", " ")
+    assert "error in mrstrain" not in said
+    assert "Traceback" not in said
+    if ends == 1:
+        log = (tmp_path / "study" / "results" / "study.log").read_text()
+        assert re.search(
+            r"mesh: FAILED .* The memory ran out .* It was tried twice; by the estimate it needs 1\.5 GiB", log
+        )
 
 
 class Machine:
@@ -110,7 +162,7 @@ def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path
     machine = Machine(big=deaths)
     runner = StageRunner(machine, lambda *_: None)
     for name in ("big", "small", "other"):
-        runner.begin(name, "mesh", {}, tmp_path / "lock")
+        runner.begin(name, "mesh", {}, tmp_path / "lock", gib=2.34)
     ended = {}
     while runner.busy:
         name, outcome, _ = runner.next()
@@ -119,7 +171,11 @@ def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path
             runner.begin("next", "mesh", {}, tmp_path / "lock")
     assert machine.begun == ["big", "small", "other", "next", "big"]
     assert list(ended) == ["small", "other", "next", "big"]
-    expected = "It died. It was tried twice." if deaths == 2 else "This was computed at the second attempt. It died."
+    expected = (
+        "It died. It was tried twice; by the estimate it needs 2.3 GiB of memory."
+        if deaths == 2
+        else "This was computed at the second attempt. It died."
+    )
     assert expected in (ended["big"] if deaths == 2 else ended["big"].lines)
 
 
@@ -138,6 +194,8 @@ def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, 
         wait_for(lambda: told)
         assert told == [("hangs", "begun", 0.0)]
         (worker,) = runner._client.nthreads()
+        # Without it, a machine that wakes up, and a clock that is set, end every worker.
+        assert runner._client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.worker_ttl) is None
         name, outcome, seconds = runner.next()
         assert (name, round(seconds)) == ("hangs", 4)
         assert "gave no sign of life for 4 s and was ended" in outcome
@@ -154,7 +212,7 @@ def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, 
 @pytest.mark.parametrize(("to_end_s", "limit_s"), [(0.0, 3600.0), (300.0, 3600.0), (5000.0, 50_000.0)])
 def test_a_long_stage_may_be_silent_for_longer(to_end_s, limit_s):
     """By what the study is expected to take from it on: a machine that is ten times as slow loses nothing."""
-    assert _Call("mesh", "mesh", {}, "lock", to_end_s).may_be_silent_s == limit_s
+    assert _Call("mesh", "mesh", {}, "lock", to_end_s, 0.0).may_be_silent_s == limit_s
 
 
 def test_a_stage_that_tells_something_now_and_then_does_not_hang(tmp_path, monkeypatch):
