@@ -298,10 +298,11 @@ def check_materials(mesh: TetMesh, materials: Materials) -> None:
         times[mesh.regions[region]] += 1
     if (times != 1).any():
         bare, twice = int((times == 0).sum()), int((times > 1).sum())
-        without = ", ".join(name for name in mesh.regions if name not in materials)
+        without = [name for name in mesh.regions if name not in materials]
+        bare_regions = f"Give each region one: {', '.join(without)} has none." if without else ""
         raise InputError(
-            f"Every cell needs exactly one material: {bare} cells have none and {twice} have more than one. Regions "
-            f"without a material: {without or 'none'}."
+            f"Every cell needs exactly one material: {bare} cells have none and {twice} have more than one. "
+            f"{bare_regions or 'Regions must not share cells, and must have all of them.'}"
         )
 
 

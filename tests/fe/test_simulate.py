@@ -305,7 +305,7 @@ def test_a_plate_without_friction_carries_no_shear() -> None:
     [
         ({"loads": [LoadStep("pulled", -1.0)]}, "pulled: the normal force must be above 0 N"),
         ({"loads": []}, "At least one load"),
-        ({"laws": {"fat": FAT}}, "Regions without a material: skin"),
+        ({"laws": {"fat": FAT}}, "Give each region one: skin has none"),
         ({"laws": LAWS | {"bone": FAT}}, "no region 'bone'; it has skin, fat"),
         ({"facets": {"skin": None}}, "no surface set 'bone'"),
         ({"element": "P3"}, "Unknown element 'P3'"),
