@@ -126,7 +126,8 @@ def anew(work: Path, study: Path, mesh: Path | None) -> None:
     shutil.rmtree(study, ignore_errors=True)
     shutil.copytree(work / "images", study)
     if mesh is not None:
-        shutil.copy(mesh, study / "mesh.vtu")
+        for file in (mesh, mesh.with_suffix(".json")):  # with the names of its regions and surfaces
+            shutil.copy(file, study / file.name)
         text = (study / "study.toml").read_text()
         assert MESHED in text
         (study / "study.toml").write_text(text.replace(MESHED, GIVEN))

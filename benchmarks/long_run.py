@@ -6,7 +6,7 @@ The stages of a small study (a heel at 2.3 mm, a mesh of 9 mm) run one after ano
 runs in: so many registrations, then so many simulations. Told after every ten, between two stages, is what the process
 tree holds: resident memory, open files, threads, files in the kernel's shared memory that carry the number of one of
 its processes, and files in its folder for temporary files (Linux only). Told at the end is what is open then and was
-not after the first ten, by its kind.
+not after the first ten, by its kind. Results are written after every ten.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +80,10 @@ def held() -> dict[str, float]:
     }
 
 
-def repeated(runner: StageRunner, stage: Stage, count: int) -> dict[str, Any]:
-    """Run a stage so many times, from nothing each time; what is held after every ten."""
+def repeated(runner: StageRunner, stage: Stage, count: int, keep: Callable[[dict[str, Any]], None]) -> None:
+    """Run a stage so many times, from nothing each time; what is held after every ten is kept at once."""
     arguments: Mapping[str, Any] = {**stage.arguments, **dict.fromkeys(stage.perhaps, ())}
-    seen, began, open_first = [], time.monotonic(), Counter[str]()
+    seen, began, first = list[dict[str, float]](), time.monotonic(), Counter[str]()
     for number in range(1, count + 1):
         for place in stage.gives:
             shutil.rmtree(place, ignore_errors=True)
@@ -93,17 +94,19 @@ def repeated(runner: StageRunner, stage: Stage, count: int) -> dict[str, Any]:
             raise SystemExit(f"{stage.name} failed: {outcome}")
         if number % EVERY == 0:
             seen.append({"after": number, **held()})
-            open_first = open_first or opened()
+            first = first or opened()
             print(stage.kind, seen[-1], flush=True)
-    first, last = (seen[0], seen[-1]) if seen else ({}, {})
-    grown = {name: round(last[name] / max(first[name], 1) - 1.0, 4) for name in first if name != "after"}
-    return {
-        "count": count,
-        "seconds": round(time.monotonic() - began, 1),
-        "held": seen,
-        "grown_since_first_ten": grown,
-        "opened_since_first_ten": opened() - open_first,
-    }
+            grown = {name: round(seen[-1][name] / max(held, 1) - 1.0, 4) for name, held in seen[0].items()}
+            del grown["after"]
+            keep(
+                {
+                    "count": number,
+                    "seconds": round(time.monotonic() - began, 1),
+                    "held": seen,
+                    "grown_since_first_ten": grown,
+                    "opened_since_first_ten": opened() - first,
+                }
+            )
 
 
 def main() -> None:
@@ -118,12 +121,14 @@ def main() -> None:
     temporary.mkdir()
     os.environ["TMPDIR"] = tempfile.tempdir = str(temporary)
     with cluster(lambda *_: None, [given.work], workers=1) as runner:
-        repeated(runner, stages["mesh"], 1)
-        runs = {
-            "register": repeated(runner, stages["register"], given.registrations),
-            "simulate": repeated(runner, stages["simulate"], given.simulations),
-        }
-    given.out.write_text(json.dumps({"versions": versions(), "runs": runs}, indent=1) + "\n")
+        runs: dict[str, Any] = {}
+
+        def kept(kind: str, run: dict[str, Any]) -> None:
+            runs[kind] = run
+            given.out.write_text(json.dumps({"versions": versions(), "runs": runs}, indent=1) + "\n")
+
+        for kind, count in (("mesh", 1), ("register", given.registrations), ("simulate", given.simulations)):
+            repeated(runner, stages[kind], count, partial(kept, kind))
 
 
 if __name__ == "__main__":

@@ -76,8 +76,9 @@ class _Call:
 class StageRunner:
     """Runs several stages at the same time; made by `cluster`."""
 
-    def __init__(self, client: Client, watch: OnProgress) -> None:
+    def __init__(self, client: Client, watch: OnProgress, *, alone: bool = False) -> None:
         self._client, self._watch = client, watch
+        self._alone = alone  # nobody else's work is on the cluster
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
@@ -110,10 +111,12 @@ class StageRunner:
     def next(self) -> tuple[str, StageResult | str, float]:
         """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s.
 
-        A stage that a process of died is tried once more, on one core and when no other is under way: its memory may
-        have run out. One that hangs is ended.
+        A stage that a process of died is tried once more, on one core, when no other is under way and in workers that
+        were started anew: its memory may have run out. One that hangs is ended.
         """
         if not self._under_way and self._died:
+            if self._alone:  # workers keep what libraries and earlier stages took
+                self._client.restart_workers([*self._client.nthreads()], raise_for_error=False)
             self._submit(self._died.pop(0))
         lost_since: float | None = None
         while True:
@@ -209,7 +212,7 @@ def cluster(
         if scheduler is None:
             with _of_this_machine(workers or usable_cores()) as client:
                 client.run(_ignore_interrupts)
-                yield StageRunner(client, watch)
+                yield StageRunner(client, watch, alone=True)
             return
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
