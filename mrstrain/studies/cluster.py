@@ -124,6 +124,10 @@ class StageRunner:
                 future = self._finished.get(timeout=_LOOK_EVERY_S)
                 break
             except queue.Empty:
+                # Dask tells the end of a stage in a thread of its own, which there may be no memory for.
+                if ended := [one for one in self._under_way if one.done()]:
+                    future = ended[0]
+                    break
                 left = self._client.status == "running" and self._client.nthreads()
                 lost_since = None if left else lost_since or time.monotonic()
                 if lost_since is not None and time.monotonic() - lost_since > _LOST_S:

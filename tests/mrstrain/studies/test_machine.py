@@ -234,6 +234,18 @@ def test_a_stage_that_tells_something_now_and_then_does_not_hang(tmp_path, monke
     assert runner._hung() is not None
 
 
+def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):
+    """Dask starts a thread for it, and where memory is short there is none: a run waited for ever."""
+    monkeypatch.setattr(Future, "add_done_callback", lambda *_: None)
+    monkeypatch.setattr(cluster, "_LOOK_EVERY_S", 0.01)
+    machine = Machine(big=1)
+    runner = StageRunner(machine, lambda *_: None)
+    runner.begin("big", "mesh", {}, tmp_path / "lock")
+    runner.begin("small", "mesh", {}, tmp_path / "lock")
+    assert [runner.next()[0] for _ in range(2)] == ["small", "big"]
+    assert not runner.busy
+
+
 def test_results_that_are_removed_under_a_run_are_not_recorded(folder, monkeypatch):
     class Removing(Here):
         def next(self) -> tuple[str, StageResult | str, float]:
