@@ -15,7 +15,7 @@ from typing import Any
 
 import dask
 import psutil
-from distributed import Client, Future, LocalCluster, get_worker
+from distributed import Client, Future, LocalCluster, Nanny, get_worker
 from filelock import FileLock
 
 from dvc.errors import InputError, MrstrainError, WorkerError
@@ -33,9 +33,9 @@ _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
-# A stage hangs that tells nothing for this long, and for this many times what the rest of its study should take.
+# A stage hangs that tells nothing new for this long, and for this many times what the rest of its study should take.
 _SILENT_S, _SILENT_TIMES = 3600.0, 10.0
-_NAME_EVERY_S = 600.0  # a stage that tells nothing
+_NAME_EVERY_S = 600.0  # a stage that tells nothing new
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts its own processes
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
@@ -69,26 +69,32 @@ class _Call:
 
     @property
     def may_be_silent_s(self) -> float:
-        """How long it may tell nothing before it is taken to hang, seconds."""
+        """How long it may tell nothing new before it is taken to hang, seconds."""
         return max(_SILENT_S, _SILENT_TIMES * self.to_end_s)
 
 
 class StageRunner:
     """Runs several stages at the same time; made by `cluster`."""
 
-    def __init__(self, client: Client, watch: OnProgress, *, alone: bool = False) -> None:
+    def __init__(self, client: Client, watch: OnProgress, local: LocalCluster | None = None) -> None:
         self._client, self._watch = client, watch
-        self._alone = alone  # nobody else's work is on the cluster
+        self._local = local  # the cluster, if it is of this machine and nobody else's work is on it
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
         self._finished: queue.Queue[Future[Any]] = queue.Queue()
         # Of each stage that has begun, for how long no news came while it was looked for; not while the machine sleeps.
         self._silent_s: dict[str, float] = {}
+        self._told: dict[str, tuple[str, float]] = {}  # the latest
         client.subscribe_topic(self._topic, lambda event: self._tell(*event[1]))
 
     def _tell(self, name: str, what: str, fraction: float) -> None:
-        self._silent_s[name] = 0.0
+        if self._told.get(name) != (
+            what,
+            fraction,
+        ):  # the same again tells that its worker lives, and not that it goes on
+            self._silent_s[name] = 0.0
+        self._told[name] = what, fraction
         self._watch(name, what, fraction)
 
     def begin(
@@ -115,7 +121,7 @@ class StageRunner:
         were started anew: its memory may have run out. One that hangs is ended.
         """
         if not self._under_way and self._died:
-            if self._alone:  # workers keep what libraries and earlier stages took
+            if self._local is not None:  # workers keep what libraries and earlier stages took
                 self._client.restart_workers([*self._client.nthreads()], raise_for_error=False)
             self._submit(self._died.pop(0))
         lost_since: float | None = None
@@ -158,7 +164,7 @@ class StageRunner:
         return name, f"The worker of this stage stopped more than once ({error}). {advice}", 0.0
 
     def _hung(self) -> Future[Any] | None:
-        """A stage that has told nothing for too long, if there is one; those that may become one are named."""
+        """A stage that has told nothing new for too long, if there is one; those that may become one are named."""
         for future, call in self._under_way.items():
             if call.name not in self._silent_s:  # it waits for a worker
                 continue
@@ -169,7 +175,7 @@ class StageRunner:
             if silent_s // _NAME_EVERY_S > before // _NAME_EVERY_S:
                 limit = f"After {duration(call.may_be_silent_s)} it is ended, and the others go on"
                 end = f"{limit}; Ctrl-C ends the run, and finished stages are kept."
-                self._watch(NOTE, f"{call.name} gave no sign of life for {duration(silent_s)}. {end}", 0.0)
+                self._watch(NOTE, f"{call.name} has not gone on for {duration(silent_s)}. {end}", 0.0)
         return None
 
     def _ended(self, hung: Future[Any]) -> tuple[str, str, float]:
@@ -184,13 +190,16 @@ class StageRunner:
         cancelled = [future for future in self._under_way if future.key in held]
         calls = [self._under_way.pop(future) for future in cancelled]
         self._client.cancel(cancelled)
+        for nanny in self._local.workers.values() if self._local is not None else ():
+            if nanny.worker_address in places:  # what hangs in native code would not notice that its worker is gone
+                _kill(_processes_of(nanny)[1:])
         self._client.restart_workers([*places], raise_for_error=False)
         for waiting in calls:
             if waiting is not call:
                 self._submit(waiting)
         return (
             call.name,
-            f"It gave no sign of life for {duration(silent_s)} and was ended. The usual causes are a network disk that "
+            f"It did not go on for {duration(silent_s)} and was ended. The usual causes are a network disk that "
             "does not answer, another run that holds the stage, and a machine that swaps its memory to disk. Run the "
             "study again; finished stages are kept.",
             silent_s,
@@ -214,9 +223,9 @@ def cluster(
     logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have their own log
     with dask.config.set(_SETTINGS):
         if scheduler is None:
-            with _of_this_machine(workers or usable_cores()) as client:
+            with _of_this_machine(workers or usable_cores()) as (local, client):
                 client.run(_ignore_interrupts)
-                yield StageRunner(client, watch, alone=True)
+                yield StageRunner(client, watch, local)
             return
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
@@ -241,7 +250,7 @@ def cluster(
 
 
 @contextmanager
-def _of_this_machine(workers: int) -> Iterator[Client]:
+def _of_this_machine(workers: int) -> Iterator[tuple[LocalCluster, Client]]:
     """A cluster of processes of this machine, ended with the block however that ends."""
     local = LocalCluster(
         n_workers=workers, threads_per_worker=1, processes=True, silence_logs=50, memory_limit=0, host="127.0.0.1",
@@ -250,7 +259,7 @@ def _of_this_machine(workers: int) -> Iterator[Client]:
     try:
         with Client(local) as client:
             try:
-                yield client
+                yield local, client
             except BaseException:
                 _kill_workers(local)
                 raise
@@ -270,14 +279,25 @@ def _kill_workers(local: LocalCluster) -> None:
     """End the processes of a cluster and what they have started; Dask would wait for stages that do not listen."""
     for nanny in local.workers.values():
         nanny.auto_restart = False
-        if nanny.pid is None:  # about to be restarted; psutil would take it for this process
-            continue
+        _kill(_processes_of(nanny))
+
+
+def _processes_of(nanny: Nanny) -> list[psutil.Process]:
+    """The process of a worker, which comes first as it would begin the next stage, and all below it."""
+    if nanny.pid is None:  # about to be restarted; psutil would take it for this process
+        return []
+    try:
+        worker = psutil.Process(nanny.pid)
+        return [worker, *worker.children(recursive=True)]
+    except psutil.Error:
+        return []
+
+
+def _kill(processes: Sequence[psutil.Process]) -> None:
+    for process in processes:
         with suppress(psutil.Error):
-            worker = psutil.Process(nanny.pid)
-            for process in (worker, *worker.children(recursive=True)):  # the worker first: it would begin the next
-                with suppress(psutil.Error):
-                    if not any(_TRACKER in word for word in process.cmdline()):
-                        process.kill()
+            if not any(_TRACKER in word for word in process.cmdline()):
+                process.kill()
 
 
 def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:

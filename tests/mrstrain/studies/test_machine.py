@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import pytest
 from filelock import FileLock
 
@@ -168,7 +169,7 @@ class Machine:
 def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path, deaths, alone):
     """In workers that were started anew, unless others may use them."""
     machine = Machine(big=deaths)
-    runner = StageRunner(machine, lambda *_: None, alone=alone)
+    runner = StageRunner(machine, lambda *_: None, SimpleNamespace() if alone else None)
     for name in ("big", "small", "other"):
         runner.begin(name, "mesh", {}, tmp_path / "lock", gib=2.34)
     ended = {}
@@ -202,18 +203,20 @@ def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, 
         wait_for(lambda: told)
         assert told == [("hangs", "begun", 0.0)]
         (worker,) = runner._client.nthreads()
+        (below,) = runner._client.run(lambda: subprocess.Popen(["sleep", "600"]).pid).values()
         # Without it, a machine that wakes up, and a clock that is set, end every worker.
         assert runner._client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.worker_ttl) is None
         name, outcome, seconds = runner.next()
         assert (name, round(seconds)) == ("hangs", 4)
-        assert "gave no sign of life for 4 s and was ended" in outcome
+        assert "did not go on for 4 s and was ended" in outcome
         assert "Run the study again" in outcome
         ((_, sentence, _),) = [event for event in told if event[0] == NOTE]
-        assert sentence.startswith("hangs gave no sign of life for 2 s. After 4 s it is ended, and the others go on")
+        assert sentence.startswith("hangs has not gone on for 2 s. After 4 s it is ended, and the others go on")
         name, outcome, _ = runner.next()
         assert name == "next"
         assert "has no attribute 'no_stage'" in outcome
         assert worker not in runner._client.nthreads()
+        wait_for(lambda: not psutil.pid_exists(below), limit_s=30.0)
         assert not runner.busy
 
 
@@ -228,9 +231,10 @@ def test_a_stage_that_tells_something_now_and_then_does_not_hang(tmp_path, monke
     monkeypatch.setattr(runner._client, "submit", lambda *_, **__: Future())
     runner.begin("slow", "mesh", {}, tmp_path / "lock")
     assert runner._hung() is None  # it has not begun
-    for _ in range(3):
-        runner._tell("slow", "meshing", 0.5)
+    for n in range(3):
+        runner._tell("slow", "registering", 0.1 * n)
         assert not any(runner._hung() for _ in range(3600))
+    runner._tell("slow", "registering", 0.2)  # as a worker tells of a process that hangs
     assert runner._hung() is not None
 
 
