@@ -146,8 +146,9 @@ class StageRunner:
             return self.next()
         name = call.name
         self._silent_s.pop(name, None)
-        if future.status == "finished":
-            outcome, seconds = future.result()
+        error = future.exception() if future.status == "error" else None
+        if future.status == "finished" or is_lack_of_memory(error):  # of the worker itself
+            outcome, seconds = (WorkerError(lack_of_machine(error)), 0.0) if error else future.result()
             if not isinstance(outcome, WorkerError):
                 lines = (f"{_TRIED} {call.died}",) if call.died else ()
                 again = isinstance(outcome, StageResult) and lines
@@ -157,7 +158,6 @@ class StageRunner:
                 return name, f"{outcome} It was tried twice{needs}.", seconds
             self._died.append(replace(call, died=str(outcome)))
             return self.next()
-        error = future.exception() if future.status == "error" else None
         if error is None:
             return name, f"The connection to the scheduler was lost, or it cancelled the stage ({future.status}).", 0.0
         advice = "The usual cause is too little memory: use fewer workers, or machines with more memory."

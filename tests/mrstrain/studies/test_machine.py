@@ -238,6 +238,18 @@ def test_a_stage_that_tells_something_now_and_then_does_not_hang(tmp_path, monke
     assert runner._hung() is not None
 
 
+def test_a_worker_without_memory_for_a_stage_counts_as_a_process_that_died(tmp_path, monkeypatch):
+    future = Future()
+    future.status = "error"
+    future.set_exception(RuntimeError("can't start new thread"))
+    runner = StageRunner(Machine(), lambda *_: None)
+    monkeypatch.setattr(runner._client, "submit", lambda *_, **__: future)
+    runner.begin("mesh", "mesh", {}, tmp_path / "lock")
+    _, outcome, _ = runner.next()
+    assert outcome.startswith("The memory ran out (can't start new thread). Free memory")
+    assert "tried twice" in outcome
+
+
 def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):
     """Dask starts a thread for it, and where memory is short there is none: a run waited for ever."""
     monkeypatch.setattr(Future, "add_done_callback", lambda *_: None)
