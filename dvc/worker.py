@@ -24,6 +24,8 @@ Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 TOO_LITTLE_MEMORY = "Free memory, use fewer --workers, crop the images, or use a coarser mesh."
 """What to do where memory ran out."""
+# What the system says of memory for a library, a process or a thread, each in an error of another kind.
+_NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "can't start new thread", "paging file is too small")
 _POLL_S = 0.5
 _UNWIND_S = 5.0  # for threads to end after an error or interrupt
 _MEMORY = {
@@ -33,6 +35,19 @@ _MEMORY = {
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
 }
+
+
+def is_lack_of_memory(failure: BaseException | None) -> bool:
+    """Whether an error, or the one that caused it, says that memory ran out.
+
+    >>> is_lack_of_memory(ImportError("_core.so: failed to map segment from shared object"))
+    True
+    """
+    while failure is not None:
+        if isinstance(failure, MemoryError) or any(sign in str(failure) for sign in _NO_MEMORY):
+            return True
+        failure = failure.__cause__
+    return False
 
 
 class Worker(AbstractContextManager["Worker", None]):
@@ -78,8 +93,6 @@ class Worker(AbstractContextManager["Worker", None]):
             try:
                 future = executor.submit(task, *args)
                 return _result(future, watched)  # type: ignore[no-any-return]
-            except MemoryError as lack:
-                raise WorkerError(f"The memory ran out while {what} ({lack}). {TOO_LITTLE_MEMORY}") from lack
             except (TerminatedWorkerError, ShutdownExecutorError) as died:
                 executor.shutdown(wait=False, kill_workers=True)
                 self._executor = None
@@ -90,6 +103,10 @@ class Worker(AbstractContextManager["Worker", None]):
                     "your own elastix parameter files with several metrics, set "
                     '(UseMultiThreadingForMetrics "false").'
                 ) from died
+            except Exception as failure:
+                if not is_lack_of_memory(failure):
+                    raise
+                raise WorkerError(f"The memory ran out while {what} ({failure}). {TOO_LITTLE_MEMORY}") from failure
             finally:
                 if future is not None and not future.done():  # an interrupt: the task would be waited for
                     executor.shutdown(wait=False, kill_workers=True)

@@ -21,6 +21,13 @@ def _crash() -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
+def _needs_a_library_that_does_not_fit() -> None:
+    try:
+        raise ImportError("_core.so: failed to map segment from shared object")
+    except ImportError as lack:
+        raise ImportError("scipy.optimize cannot be imported") from lack
+
+
 def _killed() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -71,6 +78,11 @@ def test_memory_that_runs_out_is_named_and_the_next_task_runs():
         with pytest.raises(WorkerError, match=r"memory ran out while registering Load1 \(.*16.*\)\. Free memory"):
             worker.run("registering Load1", _needs_more_memory_than_there_is)
         assert worker.run("adding", sum, [1, 2]) == 3
+
+
+def test_a_library_that_there_is_no_memory_for_is_lack_of_memory():
+    with Worker(threads=1) as worker, pytest.raises(WorkerError, match="memory ran out while meshing"):
+        worker.run("meshing", _needs_a_library_that_does_not_fit)
 
 
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])
