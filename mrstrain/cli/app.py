@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from mrstrain.cli import measurement, models, studies
-from mrstrain.cli.lines import say, wrapped
+from mrstrain.cli.lines import say
 from mrstrain.cli.options import EXAMPLES, Grouped
 from mrstrain.cli.wrapping import wrapped
 
