@@ -5,7 +5,8 @@
 The stages of a small study (a heel at 2.3 mm, a mesh of 9 mm) run one after another in the Dask worker that a study
 runs in: so many registrations, then so many simulations. Told after every ten, between two stages, is what the process
 tree holds: resident memory, open files, threads, files in the kernel's shared memory that carry the number of one of
-its processes, and files in its folder for temporary files (Linux only).
+its processes, and files in its folder for temporary files (Linux only). Told at the end is what is open then and was
+not after the first ten, by its kind. Results are written after every ten.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from dvc import write_image, write_labels
+from dvc import Image, write_image, write_labels
 from mrstrain.records.provenance import versions
 from mrstrain.studies.cluster import StageRunner, cluster
 from mrstrain.studies.file import read_study
@@ -40,13 +44,26 @@ def study_in(folder: Path) -> dict[str, Stage]:
     folder.mkdir(parents=True)
     pair = heel_pair(3, load=0.6, shape=(44, 50, 46), spacing_mm=2.3)
     fine = heel_pair(3, load=0.6, shape=(64, 72, 68), spacing_mm=1.6)
-    for name, image in (("Load0", pair.reference), ("Load1", pair.loaded), ("Load2", pair.repeat)):
+    values = pair.repeat.values.copy()
+    values[0, 0, 0] += 1.0  # no image is given twice
+    other = Image(pair.repeat.grid, values)
+    for name, image in (("Load0", pair.reference), ("Load1", pair.loaded), ("Load2", other)):
         write_image(folder / f"{name}.nii.gz", image)
     write_image(folder / "Load0-again.nii.gz", pair.repeat)
     write_labels(folder / "tissues.nii.gz", pair.labels)
     write_labels(folder / "to_mesh.nii.gz", coarse(fine.labels))
     (folder / "study.toml").write_text(STUDY)
     return {stage.kind: stage for stage in plan(read_study(folder))}
+
+
+def opened() -> Counter[str]:
+    """What this process and all below it have open, by kind: pipes, sockets, and files by their path."""
+    kinds = Counter[str]()
+    for one in (psutil.Process(), *psutil.Process().children(recursive=True)):
+        for link in Path(f"/proc/{one.pid}/fd").iterdir():
+            with suppress(OSError):  # closed meanwhile
+                kinds[re.sub(r"\d+", "N", os.readlink(link))] += 1
+    return kinds
 
 
 def held() -> dict[str, float]:
@@ -63,10 +80,10 @@ def held() -> dict[str, float]:
     }
 
 
-def repeated(runner: StageRunner, stage: Stage, count: int) -> dict[str, Any]:
-    """Run a stage so many times, from nothing each time; what is held after every ten."""
+def repeated(runner: StageRunner, stage: Stage, count: int, keep: Callable[[dict[str, Any]], None]) -> None:
+    """Run a stage so many times, from nothing each time; what is held after every ten is kept at once."""
     arguments: Mapping[str, Any] = {**stage.arguments, **dict.fromkeys(stage.perhaps, ())}
-    seen, began = [], time.monotonic()
+    seen, began, first = list[dict[str, float]](), time.monotonic(), Counter[str]()
     for number in range(1, count + 1):
         for place in stage.gives:
             shutil.rmtree(place, ignore_errors=True)
@@ -77,10 +94,19 @@ def repeated(runner: StageRunner, stage: Stage, count: int) -> dict[str, Any]:
             raise SystemExit(f"{stage.name} failed: {outcome}")
         if number % EVERY == 0:
             seen.append({"after": number, **held()})
+            first = first or opened()
             print(stage.kind, seen[-1], flush=True)
-    first, last = (seen[0], seen[-1]) if seen else ({}, {})
-    grown = {name: round(last[name] / max(first[name], 1) - 1.0, 4) for name in first if name != "after"}
-    return {"count": count, "seconds": round(time.monotonic() - began, 1), "held": seen, "grown_since_first_ten": grown}
+            grown = {name: round(seen[-1][name] / max(held, 1) - 1.0, 4) for name, held in seen[0].items()}
+            del grown["after"]
+            keep(
+                {
+                    "count": number,
+                    "seconds": round(time.monotonic() - began, 1),
+                    "held": seen,
+                    "grown_since_first_ten": grown,
+                    "opened_since_first_ten": opened() - first,
+                }
+            )
 
 
 def main() -> None:
@@ -95,12 +121,14 @@ def main() -> None:
     temporary.mkdir()
     os.environ["TMPDIR"] = tempfile.tempdir = str(temporary)
     with cluster(lambda *_: None, [given.work], workers=1) as runner:
-        repeated(runner, stages["mesh"], 1)
-        runs = {
-            "register": repeated(runner, stages["register"], given.registrations),
-            "simulate": repeated(runner, stages["simulate"], given.simulations),
-        }
-    given.out.write_text(json.dumps({"versions": versions(), "runs": runs}, indent=1) + "\n")
+        runs: dict[str, Any] = {}
+
+        def kept(kind: str, run: dict[str, Any]) -> None:
+            runs[kind] = run
+            given.out.write_text(json.dumps({"versions": versions(), "runs": runs}, indent=1) + "\n")
+
+        for kind, count in (("mesh", 1), ("register", given.registrations), ("simulate", given.simulations)):
+            repeated(runner, stages[kind], count, partial(kept, kind))
 
 
 if __name__ == "__main__":

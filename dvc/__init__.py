@@ -13,4 +13,7 @@ configuration unless a docstring states otherwise. Where to start:
 
 import lazy_loader
 
+from dvc.namesake import refuse_data_version_control
+
+refuse_data_version_control()
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numba
 from numba.core.caching import IndexDataCacheFile
+from numba.core.registry import cpu_target
 
 _DIGEST = sha256().digest_size
 
@@ -26,6 +27,11 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return kernel
 
     return compiled
+
+
+def prepare() -> None:
+    """Load what numba needs for its first loop, a third of a second: for a process that waits for its task."""
+    cpu_target.target_context.refresh()
 
 
 class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]  # numba carries no types

@@ -1,8 +1,9 @@
-"""JSON and npz files of our own, read whole: whatever is wrong with one is a ValueError.
+"""JSON, CSV and npz files of our own, read whole: whatever is wrong with one is a ValueError.
 
 The libraries below raise a dozen kinds of error on a damaged file, and take some damage for numbers.
 """
 
+import csv
 import io
 import json
 import math
@@ -29,6 +30,23 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(told, dict):
         raise ValueError(f"a {type(told).__name__}, not an object")
     return told
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV table with a header, each by the names of its columns; OSError if it cannot be opened.
+
+    ValueError for a row with other than so many cells, for quotes that do not end, and for a table without a header.
+    """
+    try:
+        head, *rows = csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline=""), strict=True)
+    except csv.Error as damage:
+        raise ValueError(f"{path.name}: {damage}") from damage
+    except UnicodeDecodeError as wrong:
+        raise ValueError(f"{path.name}: {wrong.reason} at byte {wrong.start}") from wrong
+    for number, row in enumerate(rows, start=1):
+        if len(row) != len(head):
+            raise ValueError(f"{path.name}: row {number} has {len(row)} cells, but the header has {len(head)}")
+    return [dict(zip(head, row, strict=True)) for row in rows]
 
 
 def _refused(word: str) -> NoReturn:

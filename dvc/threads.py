@@ -7,15 +7,19 @@ platforms do not allow from several threads of Python at once.
 import os
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from queue import SimpleQueue
 
 _PARTS = 4  # for each thread: what one part takes longer, another makes up for
+_on_one_core: list[None] = []  # blocks of `on_one_core`
 SMALL = 1 << 18
 """Numbers that one thread adds up before another is awake: a loop over fewer is not shared."""
 
 
 def usable_cores() -> int:
     """Number of processor cores that this process may use."""
+    if _on_one_core:
+        return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -60,18 +64,25 @@ class _Threads:
     def __init__(self, count: int) -> None:
         self.count = count
         self._loops = SimpleQueue[_Loop | None]()
-        self._started = False
+        self._helpers: int | None = None  # threads beside the caller's own, once they are started
         self._starting = threading.Lock()
 
     def ask(self, loop: _Loop) -> None:
         """Let the threads beside the caller's own take parts of a loop; the first that is asked for starts them."""
-        if not self._started:
-            with self._starting:
-                for _ in range(0 if self._started else self.count - 1):
-                    threading.Thread(target=self._serve, name="compiled", daemon=True).start()
-                self._started = True
-        for _ in range(self.count - 1):
+        with self._starting:
+            if self._helpers is None:
+                self._helpers = self._start()
+        for _ in range(self._helpers):
             self._loops.put(loop)
+
+    def _start(self) -> int:
+        """Start the threads; how many there is memory for, since the loops end without them, too."""
+        for started in range(self.count - 1):
+            try:
+                threading.Thread(target=self._serve, name="compiled", daemon=True).start()
+            except RuntimeError:
+                return started
+        return self.count - 1
 
     def _serve(self) -> None:
         while (loop := self._loops.get()) is not None:
@@ -80,7 +91,7 @@ class _Threads:
 
     def end(self) -> None:
         """End the threads; loops that they are in are finished."""
-        for _ in range(self.count - 1 if self._started else 0):
+        for _ in range(self._helpers or 0):
             self._loops.put(None)
 
 
@@ -101,6 +112,19 @@ def use(count: int) -> None:
     """Compute on so many threads from now on."""
     _threads[-1].end()
     _threads[-1] = _Threads(count)
+
+
+@contextmanager
+def on_one_core() -> Iterator[None]:
+    """Within the block, count on one core, here and in what is started side by side: where memory was short."""
+    before = count()
+    _on_one_core.append(None)
+    use(1)
+    try:
+        yield
+    finally:
+        _on_one_core.pop()
+        use(before)
 
 
 def _forked() -> None:

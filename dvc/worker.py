@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -23,6 +24,8 @@ Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 TOO_LITTLE_MEMORY = "Free memory, use fewer --workers, crop the images, or use a coarser mesh."
 """What to do where memory ran out."""
+# What the system says of memory for a library, a process or a thread, each in an error of another kind.
+_NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "can't start new thread", "paging file is too small")
 _POLL_S = 0.5
 _UNWIND_S = 5.0  # for threads to end after an error or interrupt
 _MEMORY = {
@@ -32,6 +35,19 @@ _MEMORY = {
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
 }
+
+
+def is_lack_of_memory(failure: BaseException | None) -> bool:
+    """Whether an error, or the one that caused it, says that memory ran out.
+
+    >>> is_lack_of_memory(ImportError("_core.so: failed to map segment from shared object"))
+    True
+    """
+    while failure is not None:
+        if isinstance(failure, MemoryError) or any(sign in str(failure) for sign in _NO_MEMORY):
+            return True
+        failure = failure.__cause__
+    return False
 
 
 class Worker(AbstractContextManager["Worker", None]):
@@ -52,7 +68,7 @@ class Worker(AbstractContextManager["Worker", None]):
         self._lock = threading.Lock()
 
     def start(self, *modules: str) -> None:
-        """Start the child process and let it import modules, while the caller does something else."""
+        """Start the child process, and let it import modules and what their loops need, beside the caller."""
         with self._lock:
             for module in modules:
                 self._running().submit(_imported, module)
@@ -77,8 +93,6 @@ class Worker(AbstractContextManager["Worker", None]):
             try:
                 future = executor.submit(task, *args)
                 return _result(future, watched)  # type: ignore[no-any-return]
-            except MemoryError as lack:
-                raise WorkerError(f"The memory ran out while {what} ({lack}). {TOO_LITTLE_MEMORY}") from lack
             except (TerminatedWorkerError, ShutdownExecutorError) as died:
                 executor.shutdown(wait=False, kill_workers=True)
                 self._executor = None
@@ -89,6 +103,10 @@ class Worker(AbstractContextManager["Worker", None]):
                     "your own elastix parameter files with several metrics, set "
                     '(UseMultiThreadingForMetrics "false").'
                 ) from died
+            except Exception as failure:
+                if not is_lack_of_memory(failure):
+                    raise
+                raise WorkerError(f"The memory ran out while {what} ({failure}). {TOO_LITTLE_MEMORY}") from failure
             finally:
                 if future is not None and not future.done():  # an interrupt: the task would be waited for
                     executor.shutdown(wait=False, kill_workers=True)
@@ -198,6 +216,8 @@ def _result(future: "Future[_T]", watch: Callable[[], None] = lambda: None) -> _
 
 def _imported(module: str) -> None:
     import_module(module)
+    if (compiled := sys.modules.get("dvc.compiled")) is not None:
+        compiled.prepare()
 
 
 def _end_with(parent: int) -> None:

@@ -21,6 +21,9 @@ from fe.plate import Contact, Plate
 
 _MOST_STIFFNESSES = 1000.0  # largest pressure, in shear moduli: free neo-Hookean tissue keeps 3 % of its thickness
 _UNUSUAL_MPA = 1.0  # peak pressure under the heel of a runner
+_SLIGHT_MPA = 5e-5  # the weight of 5 mm of tissue
+_SLIGHT = 1e-3  # displacement over the size of the body
+_UNITS = 1e3  # between a unit and the one that is typed for it: kN and N, m and mm
 _MM2_PER_CM2 = 100.0
 _NAMED = 3  # so many repeated cells are named
 
@@ -228,7 +231,9 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
 
 
 def _unusual(mesh: TetMesh, materials: Materials, plate: Plate, load: LoadStep) -> str:
-    """A sentence on a load of over 1 MPa on all of the skin, or that moves the plate past the bone; else nothing.
+    """A sentence on a load of over 1 MPa on all of the skin, of hardly any, or that moves the plate past the bone.
+
+    Nothing for any other load.
 
     InputError if the pressure is over 1000 times the shear modulus of the stiffest tissue, or the plate would move by
     more than the size of the body. The true pressure is higher, because the plate touches only a part of the skin.
@@ -255,8 +260,17 @@ def _unusual(mesh: TetMesh, materials: Materials, plate: Plate, load: LoadStep) 
             "Displacements are in mm."
         )
     if pressure_mpa > _UNUSUAL_MPA:
-        in_mn = " Is it in mN?" if pressure_mpa <= 1e3 * _UNUSUAL_MPA else ""
+        in_mn = " Is it in mN?" if pressure_mpa <= _UNITS * _UNUSUAL_MPA else ""
         return f"{told}; under a runner's heel it is about {_UNUSUAL_MPA:g} MPa. Forces are in N.{in_mn}"
+    if load.normal_n is not None and pressure_mpa < _SLIGHT_MPA:
+        in_kn = " Is it in kN?" if _UNITS * pressure_mpa <= _UNUSUAL_MPA else ""
+        return f"{told}, less than the weight of 5 mm of tissue. Forces are in N.{in_kn}"
+    if load.normal_mm is not None and inward_mm < _SLIGHT * size_mm:
+        in_m = " Is it in m?" if _UNITS * load.normal_mm <= size_mm else ""
+        return (
+            f"Under {load.name} the plate would move by {inward_mm:.3g} mm into the tissue, less than a thousandth of "
+            f"its size ({size_mm:.3g} mm). Displacements are in mm.{in_m}"
+        )
     bone = np.setdiff1d(mesh.facets.get(BONE, np.empty(0, dtype=np.int64)), mesh.facets[SKIN])
     bone_mm = float(points[bone, 0].min(initial=np.inf) - faces[..., 0].min())
     if inward_mm > bone_mm:
@@ -284,10 +298,11 @@ def check_materials(mesh: TetMesh, materials: Materials) -> None:
         times[mesh.regions[region]] += 1
     if (times != 1).any():
         bare, twice = int((times == 0).sum()), int((times > 1).sum())
-        without = ", ".join(name for name in mesh.regions if name not in materials)
+        without = [name for name in mesh.regions if name not in materials]
+        bare_regions = f"Give each region one: {', '.join(without)} has none." if without else ""
         raise InputError(
-            f"Every cell needs exactly one material: {bare} cells have none and {twice} have more than one. Regions "
-            f"without a material: {without or 'none'}."
+            f"Every cell needs exactly one material: {bare} cells have none and {twice} have more than one. "
+            f"{bare_regions or 'Regions must not share cells, and must have all of them.'}"
         )
 
 

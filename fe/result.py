@@ -1,6 +1,5 @@
 """Results of a load: stress, volume, statistics by region; VTU files for ParaView and tables, written and read."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from itertools import chain
@@ -12,6 +11,7 @@ import numpy as np
 from dvc import TetMesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_csv
+from dvc.own_files import read_rows
 from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
 from fe.elements import CROWDED
 from fe.load_path import PlateState
@@ -185,13 +185,15 @@ def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
 
 
 def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
-    """Read the file of `write_curve_csv`: the plate at every converged increment of each load, to eight digits."""
+    """Read the file of `write_curve_csv`: the plate at every converged increment of each load, to eight digits.
+
+    OSError, ValueError or KeyError for anything else.
+    """
     curves: dict[str, list[PlateState]] = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            vectors = {vector: np.array([float(row[c]) for c in columns]) for vector, columns in _COLUMNS.items()}
-            plate = PlateState(**vectors, area_mm2=float(row["contact_area_mm2"]))
-            curves.setdefault(row["load"], []).append(plate)
+    for row in read_rows(path):
+        vectors = {vector: np.array([float(row[c]) for c in columns]) for vector, columns in _COLUMNS.items()}
+        plate = PlateState(**vectors, area_mm2=float(row["contact_area_mm2"]))
+        curves.setdefault(row["load"], []).append(plate)
     return curves
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import dvc.errors
 import mrstrain
 from mrstrain.cli.app import app, main
-from mrstrain.cli.lines import wrapped
+from mrstrain.cli.wrapping import wrapped
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")

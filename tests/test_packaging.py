@@ -58,13 +58,12 @@ def test_the_doctests_of_every_package_are_run(wheel: set[str]) -> None:
 
 
 def test_importing_the_command_does_not_run_it() -> None:
-    main = import_module("mrstrain.__main__")
-    assert main.main is import_module("mrstrain.cli.app").main
+    assert callable(import_module("mrstrain.__main__").main)
 
 
 def test_the_wheel_carries_the_licence_and_the_command(wheel: set[str], project: dict[str, object]) -> None:
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in wheel)
-    assert project["scripts"] == {"mrstrain": "mrstrain.cli.app:main"}
+    assert project["scripts"] == {"mrstrain": "mrstrain.__main__:main"}
 
 
 def test_the_version_is_the_same_everywhere(project: dict[str, object]) -> None:
@@ -99,7 +98,7 @@ def test_the_command_line_starts_without_the_heavy_libraries() -> None:
 
 
 def test_help_comes_in_under_a_second() -> None:
-    code = "import sys; sys.argv = ['mrstrain', '--help']; from mrstrain.cli.app import main; main()"
+    code = "import sys; sys.argv = ['mrstrain', '--help']; from mrstrain.__main__ import main; main()"
     command = [sys.executable, "-c", code]
     times = []
     for _ in range(3):  # the first may compile, and the machine may be busy

@@ -9,6 +9,7 @@ from dvc.io.meshes.calculix import is_closed, time_reached as time_in_frd
 from dvc.io.meshes.febio import time_reached as time_in_xplt
 
 _BANNER = "F O R   B I O M E C H A N I C S"  # of every log of FEBio
+_END_BYTES = 1 << 16
 _NEARLY = 1.0 - 1e-3  # of the time of a run
 
 
@@ -28,7 +29,7 @@ def early_end(place: Path) -> EarlyEnd | None:
     """
     kind = place.suffix.lower()
     if kind == ".xplt":
-        log = _text(place.with_suffix(".log"))
+        log = _ends_of(place.with_suffix(".log"))
         if "N O R M A L   T E R M I N A T I O N" in log:
             return None
         time, whole = time_in_xplt(place), _febio_time(place.with_suffix(".feb"))
@@ -61,6 +62,17 @@ def _compared(time: float | None, whole: float | None, deck: str) -> EarlyEnd | 
 def _text(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+def _ends_of(file: Path) -> str:
+    """Beginning and end of a log, which tell whose it is and how the run ended; between them may lie gigabytes."""
+    try:
+        with file.open("rb") as log:
+            begin = log.read(_END_BYTES)
+            log.seek(max(len(begin), file.stat().st_size - _END_BYTES))
+            return (begin + log.read()).decode("utf-8", errors="replace")
     except OSError:
         return ""
 

@@ -1,8 +1,8 @@
 """The files of a comparison: tables of all results, fields on the mesh, and maps on the voxels of the image."""
 
-import csv
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -14,7 +14,7 @@ from dvc import Image, StrainField, evaluate_on_grid, write_image, write_vectors
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_csv
 from dvc.errors import InputError
-from dvc.own_files import read_json
+from dvc.own_files import read_json, read_rows
 from dvc.report.drawing import figure_files
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
@@ -84,7 +84,8 @@ def read_tables(folder: Path) -> list[tuple[Any, ...]]:
     for name, kind in TABLES.items():
         readers = get_type_hints(kind)  # int, float or str
         rows = _rows(folder / name, readers)
-        tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))
+        with _damage_named(folder / name):
+            tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))
     return tables
 
 
@@ -93,17 +94,26 @@ def read_curves(folder: Path) -> tuple[Curve, ...]:
     points: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for row in _rows(folder / CURVES, _CURVE_COLUMNS):
         key = row["load"], row["tissue"], row["field"]
-        points.setdefault(key, []).append((float(row["max_shear"]), float(row["volume_above_ml"])))
+        with _damage_named(folder / CURVES):
+            points.setdefault(key, []).append((float(row["max_shear"]), float(row["volume_above_ml"])))
     return tuple(Curve(*key, *np.array(of).T) for key, of in points.items())
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """InputError that names a table in which a number is none."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{path}: the table of the comparison is damaged ({error}). Compare again.") from error
 
 
 def _rows(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        rows = read_rows(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: the table of the comparison cannot be read ({error}).") from error
-    missing = [name for name in columns if rows and rows[0].get(name) is None]
+        raise InputError(f"{path}: the table of the comparison cannot be read ({error}). Compare again.") from error
+    missing = [name for name in columns if rows and name not in rows[0]]
     if missing:
         raise InputError(
             f"{path} has no column {missing[0]}; the comparison was written by another version. Compare again."

@@ -42,7 +42,7 @@ def tissue_mask(image: Image) -> Mask:
 
 def bright_voxels(image: Image) -> BoolArray:
     """Voxels that are not air: above half of Otsu's threshold on the image blurred by 1 mm, (ni, nj, nk)."""
-    blurred = smoothed(fill_missing(image), _BLUR_MM).values
+    blurred = smoothed(fill_missing(image), _BLUR_MM).values.astype(np.float64)  # bins narrower than float32 can tell
     low = float(np.percentile(blurred, 1.0))
     return np.asarray(blurred > low + 0.5 * (threshold_otsu(blurred) - low))
 

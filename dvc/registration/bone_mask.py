@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_gradient_magnitude
 
-from dvc.arrays import FloatArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
 
@@ -33,7 +33,14 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
     gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
     if not bone.inside.any() or bone.inside.all():
         return ""
-    found = {flip: _sharpness(gradient, bone, flip) for flip in product((1, -1), repeat=3)}
+    edges = bone.grid.spacing_mm
+    box = bone.box(int(np.ceil(_NEAR_MM[1] / edges.min())) + 1)
+    inside = bone.inside[box]
+    depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
+    at, near = depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
+    # A mask on the mirrored image is as sharp as the mirrored mask on the image.
+    flips = {flip: tuple(slice(None, None, way) for way in flip) for flip in product((1, -1), repeat=3)}
+    found = {flip: _sharpness(gradient[mirrored][box], at, near) for flip, mirrored in flips.items()}
     own = found.pop((1, 1, 1))
     best = max(found, key=lambda flip: found[flip])
     if not found[best] > _BETTER * own:
@@ -46,14 +53,9 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
     )
 
 
-def _sharpness(gradient: FloatArray, bone: Mask, flip: tuple[int, ...]) -> float:
-    """Of the mask on the mirrored image, which is that of the mirrored mask on the image; 0 where nothing is near."""
-    edges = bone.grid.spacing_mm
-    box = bone.box(int(np.ceil(_NEAR_MM[1] / edges.min())) + 1)
-    inside, mirrored = bone.inside[box], gradient[tuple(slice(None, None, way) for way in flip)][box]
-    depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
-    at, near = depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
+def _sharpness(gradient: FloatArray, at: BoolArray, near: BoolArray) -> float:
+    """Median of a gradient at a surface over that near it; 0 where no voxel is at or near it."""
     if not (at.any() and near.any()):
         return 0.0
-    beside = float(np.median(mirrored[near]))
-    return float(np.median(mirrored[at])) / beside if beside > 0.0 else 0.0
+    beside = float(np.median(gradient[near]))
+    return float(np.median(gradient[at])) / beside if beside > 0.0 else 0.0

@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -199,9 +200,29 @@ def _small(png: bytes) -> str:
 
 
 @cache
-def _library() -> str:
-    """The viewer's library, compressed; a page unpacks it when a viewer is asked for."""
-    return _packed(_stored("niivue.umd.js").encode())
+def _library() -> Mapping[str, str]:
+    """The viewer: its library, compressed, which a page unpacks and runs when a viewer is asked for, and its script."""
+    code = _stored("niivue.umd.js")
+    notice = f"/* niivue {NIIVUE}\n{_stored('niivue-LICENSE.txt')}*/\n"
+    return {"packed": _packed(code.encode()), "script": notice + _stored("viewer.js"), "hash": _hash(code)}
+
+
+def _hash(content: str) -> str:
+    """A script or style of a page as its content security policy names it."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
+
+
+def _policy(style: str, script: str, library: Mapping[str, str] | None) -> str:
+    """What a browser lets a page do: run and apply what was written here, by its hash, and fetch nothing."""
+    scripts, more = _hash(script), ""
+    if library:
+        scripts += f" {_hash(library['script'])} {library['hash']} 'wasm-unsafe-eval'"
+        more = "; worker-src blob:; connect-src data: blob:"
+    images = "data: blob:" if library else "data:"
+    return (
+        f"default-src 'none'; base-uri 'none'; form-action 'none'; img-src {images}; style-src {_hash(style)}; "
+        f"script-src {scripts}{more}"
+    )
 
 
 def _stored(name: str) -> str:
@@ -221,9 +242,10 @@ def write_report(
 ) -> None:
     """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
-    One HTML file without anything to fetch; all text is escaped. With two sections or more a list of them, with their
-    verdicts, stands beside them. ``notes``, a line each, stand below the verdict. Closing sections and provenance are
-    folded. A browser loads a page anew every ``reload_s`` seconds. OutputError if the file cannot be written.
+    One HTML file without anything to fetch. All text is escaped, and a browser runs no script but those of this
+    package. With two sections or more a list of them, with their verdicts, stands beside them. ``notes``, a line each,
+    stand below the verdict. Closing sections and provenance are folded. A browser loads a page anew every ``reload_s``
+    seconds. OutputError if the file cannot be written.
     """
     told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance, "closing": closing}
     volumes: dict[str, str] = {}  # each once, however many viewers show it
@@ -233,11 +255,11 @@ def write_report(
     pictures = [picture for section in (*sections, *closing) for picture in section.pictures]
     with ThreadPoolExecutor(usable_cores()) as pool:  # which the template then finds done
         list(pool.map(_small, (png for one in pictures for png in (one.png, *(png for _, png in one.beneath)))))
-    scripts = {"page": _stored("page.js"), "viewer": _stored("viewer.js")}
-    library = {"version": NIIVUE, "licence": _stored("niivue-LICENSE.txt"), "packed": _library()} if volumes else None
+    style, script, library = _stored("page.css"), _stored("page.js"), _library() if volumes else None
     page = _template("report").render(
-        **told, sections=sections, volumes=volumes, scripts=scripts, library=library, reload_s=reload_s, beneath={}
-    )
+        **told, sections=sections, volumes=volumes, style=style, script=script, library=library,
+        policy=_policy(style, script, library), reload_s=reload_s, beneath={},
+    )  # fmt: skip
     write_whole(path, page)
 
 

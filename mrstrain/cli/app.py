@@ -15,8 +15,9 @@ from typing import Annotated
 import typer
 
 from mrstrain.cli import measurement, models, studies
-from mrstrain.cli.lines import say, wrapped
+from mrstrain.cli.lines import say
 from mrstrain.cli.options import EXAMPLES, Grouped
+from mrstrain.cli.wrapping import wrapped
 
 _GREETING = """\
 mrstrain measures strain inside soft tissue from pairs of MR images, and compares finite-element models with it.
@@ -88,13 +89,6 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point: errors made on purpose are printed as sentences, with exit status 2."""
-    if len(sys.argv) > 1 and not {"--help", "-h"} & set(sys.argv[1:]):
-        from mrstrain.records.doctor import refuse_foreign_packages
-
-        try:
-            refuse_foreign_packages()  # before anything of dvc is imported: it might not be ours
-        except ImportError as error:
-            _stop(str(error))
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     _share_arenas()
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.

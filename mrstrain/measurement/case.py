@@ -3,13 +3,17 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from dvc import Measurement, Verdict
+import dvc
+from dvc import Verdict
 from dvc.atomic_files import write_json
 from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.report.page import Section, record_lines, write_report
 from dvc.trust.verdict import worst
+
+if TYPE_CHECKING:  # it draws, and matplotlib takes half a second: `Plan.register` loads it meanwhile
+    from dvc import Measurement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +28,7 @@ class Case:
     """Number and size of the voxels of its maps, in words."""
 
     @classmethod
-    def of(cls, measurement: Measurement, folder: Path, record: Mapping[str, object]) -> Self:
+    def of(cls, measurement: "Measurement", folder: Path, record: Mapping[str, object]) -> Self:
         """Write a measurement, with its provenance; its folder is there whole or not at all."""
         section, voxels = measurement.write(folder, record), str(measurement.maps.grid).partition(", box")[0]
         return cls(folder, section, tuple(measurement.summary()), measurement.headline, voxels)
@@ -40,9 +44,9 @@ class Case:
         assert self.section.verdict is not None
         return self.section.verdict
 
-    def measurement(self) -> Measurement:
+    def measurement(self) -> "Measurement":
         """The measurement, read from its folder."""
-        return Measurement.read(self.folder)
+        return dvc.Measurement.read(self.folder)
 
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, for a person."""

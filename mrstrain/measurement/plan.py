@@ -3,11 +3,12 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 
 import dvc
-from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject
+from dvc import Deformation, Evidence, Image, Registration, Settings, Subject
 from dvc.errors import MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.error_bars import TwinCheck
@@ -42,6 +43,7 @@ class Plan:
 
     def register(self, name: str, loaded: Image, start: Deformation | None, worker: Worker, tell: Tell) -> Registered:
         """Register a loaded image, or the repeat scan if its ``name`` is "repeat", and the pair's twin."""
+        Thread(target=lambda: dvc.Measurement, daemon=True).start()  # loaded while the worker is at work
         is_repeat = name == REPEAT
         of, how = self.subject, self.settings.of_repeat() if is_repeat else self.settings
         found = dvc.register(
@@ -56,7 +58,9 @@ class Plan:
         (found, twin), is_repeat = done, folder.name == REPEAT
         more = Evidence(noise_floor=floor) if is_repeat else replace(self.evidence, noise_floor=floor)
         evidence = replace(more, error_model=self.evidence.error_model, twin=twin)
-        measured = Measurement.from_registration(found, self.subject, evidence, name=folder.name, is_repeat=is_repeat)
+        measured = dvc.Measurement.from_registration(
+            found, self.subject, evidence, name=folder.name, is_repeat=is_repeat, draw=True
+        )
         return Case.of(measured, folder, self.record), measured.quality.noise_floor
 
 

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from dvc import Deformation, Measurement, read_displacement, read_transform
+import dvc
+from dvc import Deformation, read_displacement, read_transform
 from dvc.errors import InputError
 from mrstrain.measurement.case import Case, Series
 from mrstrain.options.door import door
@@ -60,6 +61,6 @@ def strain(
     record = provenance("strain", {**subject.files, "deformation": source}, parameters)
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
     refuse_touching_inputs(target, [name], [source, *subject.files.values()])
-    measured = Measurement.from_deformation(total, subject, name=name)
+    measured = dvc.Measurement.from_deformation(total, subject, name=name)
     make_output(target)
     return Series.of(target, (Case.of(measured, target / name, record),), {}, record)

@@ -72,25 +72,25 @@ def refuse_foreign_packages() -> None:
     """
     if reasons := _foreign_packages():
         raise ForeignPackageError(
-            f"{' '.join(reasons)} Install mrstrain in an environment of its own: python -m venv "
-            "mrstrain-env, then mrstrain-env/bin/pip install mrstrain (or: uv tool install mrstrain)."
+            f"{' '.join(reasons)} Install mrstrain in an environment of its own: python -m venv mrstrain-env, and "
+            "install it there."
         )
 
 
 def _foreign_packages() -> list[str]:
     home = Path(__file__).resolve().parents[2]
-    reasons = []
+    reasons: dict[str, str] = {}  # one for each package
     for name, (package, title) in _RIVALS.items():
         try:
             rival = importlib.metadata.distribution(name)
         except importlib.metadata.PackageNotFoundError:
             continue
         if _brings(rival, package):
-            reasons.append(
+            reasons[package] = (
                 f"The distribution {name}{title} {rival.version} is installed in the same environment, and its package "
                 f"{package!r} has the same name as one of mrstrain."
             )
-    for package in _OURS:
+    for package in (one for one in _OURS if one not in reasons):
         try:
             spec = importlib.util.find_spec(package)
         except ValueError:  # a module in sys.modules without a spec
@@ -98,8 +98,8 @@ def _foreign_packages() -> list[str]:
         places = [Path(place).resolve() for place in spec.submodule_search_locations or ()] if spec else []
         if home / package not in places:
             found = f"found in {spec.origin}" if spec and spec.origin else "not found"
-            reasons.append(f"The package {package!r} should be in {home}, but is {found}.")
-    return reasons
+            reasons[package] = f"The package {package!r} should be in {home}, but is {found}."
+    return list(reasons.values())
 
 
 def _brings(distribution: importlib.metadata.Distribution, package: str) -> bool:

@@ -116,7 +116,7 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") ->
     if free < needed:
         raise OutputError(
             f"{out}: {what} about {needed / 1e6:.0f} MB, but the disk has only {free / 1e6:.0f} MB left. Free disk "
-            f"space, choose another folder (out){instead}."
+            f"space, or choose another folder (out){instead}."
         )
 
 

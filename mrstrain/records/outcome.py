@@ -1,12 +1,13 @@
 """What a function that leaves files has to tell of them."""
 
 import errno
+import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvc.worker import TOO_LITTLE_MEMORY
+from dvc.worker import TOO_LITTLE_MEMORY, is_lack_of_memory
 
 _OF_DISKS = (errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE)
 
@@ -27,11 +28,15 @@ class Outcome:
 def lack_of_machine(failure: BaseException) -> str:
     """What this machine lacks, in a sentence and what to do, if a failure comes from that; empty for any other.
 
+    >>> lack_of_machine(MemoryError())
+    'The memory ran out. Free memory, use fewer --workers, crop the images, or use a coarser mesh.'
     >>> lack_of_machine(OSError(28, "No space left on device", "/tmp/a"))
     '/tmp/a: No space left on device. Free disk space or change the permissions, then run it again.'
     """
-    if isinstance(failure, MemoryError):
-        return f"The memory ran out ({failure}). {TOO_LITTLE_MEMORY}"
+    if is_lack_of_memory(failure):
+        said = re.sub(r"/\S*/", "", str(failure))  # a library by its name: the memory is to blame, not its folder
+        said = f" ({said})" if said else ""
+        return f"The memory ran out{said}. {TOO_LITTLE_MEMORY}"
     if isinstance(failure, OSError) and failure.errno in _OF_DISKS:
         what = f"{failure.filename or tempfile.gettempdir()}: {failure.strerror}"
         return f"{what}. Free disk space or change the permissions, then run it again."

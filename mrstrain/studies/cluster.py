@@ -8,21 +8,22 @@ import time
 import traceback
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import dask
 import psutil
-from distributed import Client, Future, LocalCluster, get_worker
+from distributed import Client, Future, LocalCluster, Nanny, get_worker
 from filelock import FileLock
 
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.software import software_key
-from dvc.threads import usable_cores
+from dvc.threads import on_one_core, usable_cores
+from dvc.worker import is_lack_of_memory
 from mrstrain.records.outcome import lack_of_machine
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import NOTE, OnProgress, duration
 from mrstrain.studies import stages
 from mrstrain.studies.stages import StageResult
 
@@ -32,9 +33,15 @@ _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
+# A stage hangs that tells nothing new for this long, and for this many times what the rest of its study should take.
+_SILENT_S, _SILENT_TIMES = 3600.0, 10.0
+_NAME_EVERY_S = 600.0  # a stage that tells nothing new
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts its own processes
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
+    # Workers that were not heard of for minutes by the clock would be ended: on a machine that slept, on one that has
+    # too much to do, and when the clock is set. A stage that hangs is noticed by what it tells.
+    "distributed.scheduler.worker-ttl": None,
     "distributed.worker.memory.terminate": False,  # memory is used in those processes
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.spill": False,
@@ -56,37 +63,66 @@ class _Call:
     function: str
     arguments: dict[str, Any]
     lock: str
-    urgency: float
+    to_end_s: float  # expected, from its start to the end of the study
+    gib: float  # of memory, expected; 0 if not known
     died: str = ""  # how a process of it died at the first attempt
+
+    @property
+    def may_be_silent_s(self) -> float:
+        """How long it may tell nothing new before it is taken to hang, seconds."""
+        return max(_SILENT_S, _SILENT_TIMES * self.to_end_s)
 
 
 class StageRunner:
     """Runs several stages at the same time; made by `cluster`."""
 
-    def __init__(self, client: Client, watch: OnProgress) -> None:
-        self._client = client
+    def __init__(self, client: Client, watch: OnProgress, local: LocalCluster | None = None) -> None:
+        self._client, self._watch = client, watch
+        self._local = local  # the cluster, if it is of this machine and nobody else's work is on it
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
         self._finished: queue.Queue[Future[Any]] = queue.Queue()
-        client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
+        # Of each stage that has begun, for how long no news came while it was looked for; not while the machine sleeps.
+        self._silent_s: dict[str, float] = {}
+        self._told: dict[str, tuple[str, float]] = {}  # the latest
+        client.subscribe_topic(self._topic, lambda event: self._tell(*event[1]))
 
-    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, urgency: float = 0.0) -> None:
-        """Queue a stage; it starts when a worker and its lock are free, the most urgent of the waiting stages first."""
-        self._submit(_Call(name, function, dict(arguments), str(lock), urgency))
+    def _tell(self, name: str, what: str, fraction: float) -> None:
+        if self._told.get(name) != (
+            what,
+            fraction,
+        ):  # the same again tells that its worker lives, and not that it goes on
+            self._silent_s[name] = 0.0
+        self._told[name] = what, fraction
+        self._watch(name, what, fraction)
+
+    def begin(
+        self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, to_end_s: float = 0.0,
+        gib: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Queue a stage; it starts when a worker and its lock are free.
+
+        Of the waiting stages, that one is first from whose start the study is expected to take the most seconds. A
+        stage that fails for lack of memory tells what it is expected to need.
+        """
+        self._submit(_Call(name, function, dict(arguments), str(lock), to_end_s, gib))
 
     def _submit(self, call: _Call) -> None:
         key = f"{call.name.replace(' ', '-')}-{uuid.uuid4().hex}"
-        future = self._client.submit(_run, self._topic, call, key=key, pure=False, priority=call.urgency)
+        future = self._client.submit(_run, self._topic, call, key=key, pure=False, priority=call.to_end_s)
         self._under_way[future] = call
         future.add_done_callback(self._finished.put)
 
     def next(self) -> tuple[str, StageResult | str, float]:
         """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s.
 
-        A stage that a process of died is tried once more when no other is under way: its memory may have run out.
+        A stage that a process of died is tried once more, on one core, when no other is under way and in workers that
+        were started anew: its memory may have run out. One that hangs is ended.
         """
         if not self._under_way and self._died:
+            if self._local is not None:  # workers keep what libraries and earlier stages took
+                self._client.restart_workers([*self._client.nthreads()], raise_for_error=False)
             self._submit(self._died.pop(0))
         lost_since: float | None = None
         while True:
@@ -94,30 +130,80 @@ class StageRunner:
                 future = self._finished.get(timeout=_LOOK_EVERY_S)
                 break
             except queue.Empty:
+                # Dask tells the end of a stage in a thread of its own, which there may be no memory for.
+                if ended := [one for one in self._under_way if one.done()]:
+                    future = ended[0]
+                    break
                 left = self._client.status == "running" and self._client.nthreads()
                 lost_since = None if left else lost_since or time.monotonic()
                 if lost_since is not None and time.monotonic() - lost_since > _LOST_S:
                     future = next(iter(self._under_way))
                     return self._under_way.pop(future).name, "The scheduler, or every worker, has stopped.", 0.0
+                if hung := self._hung():
+                    return self._ended(hung)
         call = self._under_way.pop(future, None)
         if call is None:  # abandoned before
             return self.next()
         name = call.name
-        if future.status == "finished":
-            outcome, seconds = future.result()
+        self._silent_s.pop(name, None)
+        error = future.exception() if future.status == "error" else None
+        if future.status == "finished" or is_lack_of_memory(error):  # of the worker itself
+            outcome, seconds = (WorkerError(lack_of_machine(error)), 0.0) if error else future.result()
             if not isinstance(outcome, WorkerError):
                 lines = (f"{_TRIED} {call.died}",) if call.died else ()
                 again = isinstance(outcome, StageResult) and lines
                 return name, replace(outcome, lines=(*outcome.lines, *lines)) if again else outcome, seconds
             if call.died:
-                return name, f"{outcome} It was tried twice.", seconds
+                needs = f"; by the estimate it needs {call.gib:.1f} GiB of memory" if call.gib else ""
+                return name, f"{outcome} It was tried twice{needs}.", seconds
             self._died.append(replace(call, died=str(outcome)))
             return self.next()
-        error = future.exception() if future.status == "error" else None
         if error is None:
             return name, f"The connection to the scheduler was lost, or it cancelled the stage ({future.status}).", 0.0
         advice = "The usual cause is too little memory: use fewer workers, or machines with more memory."
         return name, f"The worker of this stage stopped more than once ({error}). {advice}", 0.0
+
+    def _hung(self) -> Future[Any] | None:
+        """A stage that has told nothing new for too long, if there is one; those that may become one are named."""
+        for future, call in self._under_way.items():
+            if call.name not in self._silent_s:  # it waits for a worker
+                continue
+            before = self._silent_s[call.name]
+            self._silent_s[call.name] = silent_s = before + _LOOK_EVERY_S
+            if silent_s > call.may_be_silent_s:
+                return future
+            if silent_s // _NAME_EVERY_S > before // _NAME_EVERY_S:
+                limit = f"After {duration(call.may_be_silent_s)} it is ended, and the others go on"
+                end = f"{limit}; Ctrl-C ends the run, and finished stages are kept."
+                self._watch(NOTE, f"{call.name} has not gone on for {duration(silent_s)}. {end}", 0.0)
+        return None
+
+    def _ended(self, hung: Future[Any]) -> tuple[str, str, float]:
+        """End a stage that hangs with its worker, which is started anew where a nanny watches it.
+
+        What waits for that worker is queued anew: Dask would count the end of the worker against it.
+        """
+        call = self._under_way[hung]
+        silent_s = self._silent_s.pop(call.name)
+        places = {address: {*keys} for address, keys in self._client.processing().items() if hung.key in keys}
+        held = {hung.key}.union(*places.values())
+        cancelled = [future for future in self._under_way if future.key in held]
+        calls = [self._under_way.pop(future) for future in cancelled]
+        self._client.cancel(cancelled)
+        for nanny in self._local.workers.values() if self._local is not None else ():
+            if nanny.worker_address in places:  # what hangs in native code would not notice that its worker is gone
+                _kill(_processes_of(nanny)[1:])
+        self._client.restart_workers([*places], raise_for_error=False)
+        for waiting in calls:
+            if waiting is not call:
+                self._submit(waiting)
+        return (
+            call.name,
+            f"It did not go on for {duration(silent_s)} and was ended. The usual causes are a network disk that "
+            "does not answer, another run that holds the stage, and a machine that swaps its memory to disk. Run the "
+            "study again; finished stages are kept.",
+            silent_s,
+        )
 
     @property
     def busy(self) -> bool:
@@ -137,19 +223,9 @@ def cluster(
     logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have their own log
     with dask.config.set(_SETTINGS):
         if scheduler is None:
-            with (
-                LocalCluster(
-                    n_workers=workers or usable_cores(), threads_per_worker=1, processes=True, silence_logs=50,
-                    memory_limit=0, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-                ) as local,
-                Client(local) as client,
-            ):  # fmt: skip
+            with _of_this_machine(workers or usable_cores()) as (local, client):
                 client.run(_ignore_interrupts)
-                try:
-                    yield StageRunner(client, watch)
-                except BaseException:
-                    _kill_workers(local)
-                    raise
+                yield StageRunner(client, watch, local)
             return
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
@@ -173,6 +249,27 @@ def cluster(
                 client.cancel(list(runner._under_way))
 
 
+@contextmanager
+def _of_this_machine(workers: int) -> Iterator[tuple[LocalCluster, Client]]:
+    """A cluster of processes of this machine, ended with the block however that ends."""
+    local = LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=True, silence_logs=50, memory_limit=0, host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+    )  # fmt: skip
+    try:
+        with Client(local) as client:
+            try:
+                yield local, client
+            except BaseException:
+                _kill_workers(local)
+                raise
+    finally:
+        try:
+            local.close()
+        except TimeoutError:  # a worker that lacks memory may not end when it is asked to
+            _kill_workers(local)
+
+
 def _ignore_interrupts() -> None:
     """Leave Ctrl-C, which a terminal sends to every process, to the one that a person has started."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -182,14 +279,25 @@ def _kill_workers(local: LocalCluster) -> None:
     """End the processes of a cluster and what they have started; Dask would wait for stages that do not listen."""
     for nanny in local.workers.values():
         nanny.auto_restart = False
-        if nanny.pid is None:  # about to be restarted; psutil would take it for this process
-            continue
+        _kill(_processes_of(nanny))
+
+
+def _processes_of(nanny: Nanny) -> list[psutil.Process]:
+    """The process of a worker, which comes first as it would begin the next stage, and all below it."""
+    if nanny.pid is None:  # about to be restarted; psutil would take it for this process
+        return []
+    try:
+        worker = psutil.Process(nanny.pid)
+        return [worker, *worker.children(recursive=True)]
+    except psutil.Error:
+        return []
+
+
+def _kill(processes: Sequence[psutil.Process]) -> None:
+    for process in processes:
         with suppress(psutil.Error):
-            worker = psutil.Process(nanny.pid)
-            for process in (worker, *worker.children(recursive=True)):  # the worker first: it would begin the next
-                with suppress(psutil.Error):
-                    if not any(_TRACKER in word for word in process.cmdline()):
-                        process.kill()
+            if not any(_TRACKER in word for word in process.cmdline()):
+                process.kill()
 
 
 def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
@@ -240,14 +348,13 @@ def _run(topic: str, call: _Call) -> tuple[StageResult | WorkerError | str, floa
     stage: Callable[..., StageResult] = getattr(stages, call.function)
     outcome: StageResult | WorkerError | str
     try:
-        with FileLock(call.lock):
+        with FileLock(call.lock), on_one_core() if call.died else nullcontext():
             outcome = stage(tell, **call.arguments)
     except WorkerError as death:
         outcome = WorkerError(str(death))
-    except MemoryError as lack:
-        outcome = WorkerError(lack_of_machine(lack))
     except MrstrainError as error:
         outcome = str(error)
     except Exception as error:
-        outcome = lack_of_machine(error) or _A_FAULT + traceback.format_exc()
+        lack = lack_of_machine(error)
+        outcome = WorkerError(lack) if is_lack_of_memory(error) else lack or _A_FAULT + traceback.format_exc()
     return outcome, time.monotonic() - began

@@ -1,6 +1,5 @@
 """`cohort`: runs the studies of many subjects on one cluster, with one table and report for all."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
+from dvc.own_files import read_rows
 from dvc.report.drawing import Drawing
 from dvc.report.page import Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
@@ -135,9 +135,17 @@ def _uncounted(one: StudyRun) -> str:
 
 
 def _areas(out: Path) -> list[dict[str, str]]:
-    """The areas of all soft tissue in the results of a study."""
-    with (out / COMPARISON / "areas.csv").open(newline="", encoding="utf-8") as file:
-        return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
+    """The areas of all soft tissue in the results of a study; InputError for a damaged table."""
+    path = out / COMPARISON / "areas.csv"
+    try:
+        rows = [row for row in read_rows(path) if row["tissue"] == ALL]
+        for row in rows:
+            _ = row["model"], row["load"], *(float(row[name]) for name in ("ml", "share", "estimate_ml"))
+    except (OSError, ValueError, KeyError) as damage:
+        raise InputError(
+            f"{path}: the table of the comparison is damaged ({damage}). Compare again: mrstrain run --force compare."
+        ) from damage
+    return rows
 
 
 def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str, dict[str, float]], list[str]]:

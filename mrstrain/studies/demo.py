@@ -23,7 +23,7 @@ from mrstrain.studies.watch import Follower, OnReport
 from mrstrain.truth.phantom import TRUTH, phantom
 from phantoms import Heel, TissueError, errors_of_maps, heel_grid, labels_of, labels_to_mesh
 
-_SETS = ("trebbi", "luboz", "akrami")
+_SETS = ("trebbi", "erdemir", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
 _COARSE = "tissues_to_mesh_coarse"
 _COARSE_MM = 1.2  # voxels of the label map that is meshed

@@ -79,6 +79,7 @@ class Pipeline:
         self._only, self._force = tuple(only), tuple(force)
         self.outcomes: dict[str, StageOutcome] = {}
         self.seconds_to_end: Mapping[str, float] = {}  # by stage; the one with most is started first
+        self.gib: Mapping[str, float] = {}  # of memory that each stage is expected to need
         self._keys: dict[str, tuple[str, Mapping[str, Any]]] = {}
         self._waiting = {stage.name: stage for stage in stages}
 
@@ -86,7 +87,7 @@ class Pipeline:
         """Outcomes in the order of the stages."""
         return {stage.name: self.outcomes[stage.name] for stage in self.stages}
 
-    def _urgency(self, stage: Stage) -> float:
+    def _to_end_s(self, stage: Stage) -> float:
         return self.seconds_to_end.get(stage.name, 0.0)
 
     def _requested(self, stage: Stage) -> bool:
@@ -170,7 +171,7 @@ class Pipeline:
         for name, outcome in self.outcomes.items():
             if name not in before:
                 log(str(outcome))
-        ready.sort(key=lambda one: -self._urgency(one[0]))
+        ready.sort(key=lambda one: -self._to_end_s(one[0]))
         for stage, arguments in ready:
             try:
                 self.ledger.clear(stage, files=not stage.goes_on or stage.is_one_of(self._force))
@@ -179,8 +180,8 @@ class Pipeline:
             except (OSError, MrstrainError) as failure:
                 self.end(stage.name, str(failure), 0.0, log)
                 continue
-            lock, urgency = self.ledger.lock(stage), self._urgency(stage)
-            runner().begin(prefix + stage.name, stage.kind, arguments, lock, urgency)
+            needs = self._to_end_s(stage), self.gib.get(stage.name, 0.0)
+            runner().begin(prefix + stage.name, stage.kind, arguments, self.ledger.lock(stage), *needs)
 
     def end(self, name: str, result: StageResult | str, seconds: float, log: Log) -> None:
         """Record the outcome of a stage that ran on the cluster: its result, or the reason of its failure."""

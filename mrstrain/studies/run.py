@@ -16,7 +16,7 @@ from dvc.threads import usable_cores
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
-from mrstrain.studies.costs import CARE, costs, disk_bytes, expected, sizes_of
+from mrstrain.studies.costs import CARE, costs, disk_bytes, expected, gib_of, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
@@ -154,6 +154,7 @@ def run_studies(
                 of_stages = expected(left, study, voxels, cells)
                 expectations |= {prefix + name: one.after(prefix) for name, one in of_stages.items()}
                 pipelines[prefix].seconds_to_end = seconds_to_end(of_stages)
+                pipelines[prefix].gib = {stage.name: gib_of(stage, study, voxels, cells) for stage in left}
                 if scheduler is None:
                     _tell(costs(study, stages, left, voxels, cells, at_once), log)
         with watch.reporting():

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dvc.errors import OutputError
 from dvc.io.result_folder import REPORT
-from mrstrain.records.progress import ALL, OnProgress, duration
+from mrstrain.records.progress import ALL, NOTE, OnProgress, duration
 from mrstrain.studies.file import Study
 from mrstrain.studies.page import write_page_in_progress, write_run_report
 from mrstrain.studies.pipeline import Pipeline, StageOutcome
@@ -90,6 +90,8 @@ class Watch:
     def told(self, name: str, what: str, fraction: float) -> None:
         """Take the progress of a stage that is under way."""
         with self._lock:
+            if name == NOTE:
+                self.tell(name, what, fraction)
             if name not in self.left.stages or name in self.left.took:
                 return
             if name not in self.left.began:

@@ -1,4 +1,4 @@
-"""JSON and npz files of our own: read as they were written, or refused in one way whatever is wrong with them."""
+"""JSON, CSV and npz files of our own: read as they were written, or refused in one way whatever is wrong with them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvc.own_files import read_arrays, read_json
+from dvc.own_files import read_arrays, read_json, read_rows
 
 KEPT = {"counts": np.arange(40.0), "name": np.array("a name")}
 
@@ -58,3 +58,18 @@ def test_json_that_no_file_of_ours_holds_is_refused(tmp_path: Path, text: str) -
 def test_numbers_of_json_are_kept(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"a": [1, -2.5e-3, null, true]}')
     assert read_json(tmp_path / "a.json") == {"a": [1, -2.5e-3, None, True]}
+
+
+def test_a_table_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text('load,n\n"#1, ""slow""",2.5\n')
+    assert read_rows(tmp_path / "a.csv") == [{"load": '#1, "slow"', "n": "2.5"}]
+
+
+@pytest.mark.parametrize(
+    "table", [b"", b"load,n\nA\n", b"load,n\nA,1,2\n", b'load,n\n"A,1\n', b'load,n\n"A"x,1\n', b"load,n\n\xff,1\n",
+              b"load,n\n\n", b"load,n\n" + b"A" * 200_000 + b",1\n"]
+)  # fmt: skip
+def test_a_damaged_table_is_refused(tmp_path: Path, table: bytes) -> None:
+    (tmp_path / "a.csv").write_bytes(table)
+    with pytest.raises(ValueError):  # noqa: PT011 - of any kind
+        read_rows(tmp_path / "a.csv")

@@ -33,6 +33,37 @@ def test_every_number_of_a_range_is_done_once(count, size):
     np.testing.assert_array_equal(out, np.arange(size) ** 2)
 
 
+def test_a_loop_ends_where_no_thread_can_be_started(monkeypatch):
+    """As where memory is limited: each has a stack of megabytes."""
+    started = threading.Thread.start
+    seen = list[threading.Thread]()
+
+    def start(thread: threading.Thread) -> None:
+        seen.append(thread)
+        if len(seen) > 1:
+            raise RuntimeError("can't start new thread")
+        started(thread)
+
+    pool, out = threads._Threads(4), np.zeros(1000, dtype=np.int64)
+    monkeypatch.setattr(threads, "_threads", [pool])
+    monkeypatch.setattr(threading.Thread, "start", start)
+    for _ in range(3):
+        threads.in_parts(squares, 1000, out)
+    np.testing.assert_array_equal(out, 3 * np.arange(1000) ** 2)
+    assert len(seen) == 2
+    pool.end()
+    seen[0].join(5.0)
+    assert not seen[0].is_alive()
+    assert pool._loops.empty()
+
+
+def test_one_core_is_counted_on_within_the_block():
+    before = threads.count(), threads.usable_cores()
+    with threads.on_one_core():
+        assert (threads.count(), threads.usable_cores()) == (1, 1)
+    assert (threads.count(), threads.usable_cores()) == before
+
+
 def test_a_thread_that_comes_too_late_is_not_taken_for_one_that_has_finished():
     go_on, out = threading.Event(), np.zeros(1)
 

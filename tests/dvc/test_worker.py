@@ -21,6 +21,13 @@ def _crash() -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
+def _needs_a_library_that_does_not_fit() -> None:
+    try:
+        raise ImportError("_core.so: failed to map segment from shared object")
+    except ImportError as lack:
+        raise ImportError("scipy.optimize cannot be imported") from lack
+
+
 def _killed() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -73,6 +80,11 @@ def test_memory_that_runs_out_is_named_and_the_next_task_runs():
         assert worker.run("adding", sum, [1, 2]) == 3
 
 
+def test_a_library_that_there_is_no_memory_for_is_lack_of_memory():
+    with Worker(threads=1) as worker, pytest.raises(WorkerError, match="memory ran out while meshing"):
+        worker.run("meshing", _needs_a_library_that_does_not_fit)
+
+
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])
 def test_death_is_an_error_that_says_so_and_the_next_task_runs(task, signal_name):
     with Worker(threads=1) as worker:
@@ -104,6 +116,12 @@ def test_a_started_worker_has_imported_what_it_was_told_and_is_the_first_to_be_u
         assert used == [(first, True)]
     with Worker(threads=1) as other:
         assert not other.run("asking", _imports, "wave")
+
+
+def test_a_started_worker_is_ready_to_run_compiled_loops():
+    with Worker(threads=1) as worker:
+        worker.start("dvc.images.tissue")
+        assert worker.run("asking", _imports, "numba.cpython.setobj")  # which numba imports for its first loop
 
 
 def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():

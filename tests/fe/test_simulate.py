@@ -305,7 +305,7 @@ def test_a_plate_without_friction_carries_no_shear() -> None:
     [
         ({"loads": [LoadStep("pulled", -1.0)]}, "pulled: the normal force must be above 0 N"),
         ({"loads": []}, "At least one load"),
-        ({"laws": {"fat": FAT}}, "Regions without a material: skin"),
+        ({"laws": {"fat": FAT}}, "Give each region one: skin has none"),
         ({"laws": LAWS | {"bone": FAT}}, "no region 'bone'; it has skin, fat"),
         ({"facets": {"skin": None}}, "no surface set 'bone'"),
         ({"element": "P3"}, "Unknown element 'P3'"),
@@ -336,6 +336,12 @@ def test_what_cannot_be_simulated_is_refused(change: dict, said: str) -> None:
         (LoadStep("a", 300.0), 0.0, ""),  # 0.75 MPa
         (LoadStep("a", 800.0), 0.0, "800 N, is a pressure of 2 MPa .* runner's heel .* Is it in mN"),
         (LoadStep("a", 2.0, -800.0), 0.0, "800 N, is a pressure of 2 MPa"),
+        (LoadStep("a", 0.05), 0.0, ""),  # 0.125 kPa
+        (LoadStep("a", 0.015), 0.0, r"0.015 N, is .* than the weight of 5 mm of tissue. Forces are in N. Is it in kN"),
+        (LoadStep("a", 0.015, 2.0), 0.0, ""),
+        (LoadStep("a", normal_mm=3.05), 3.0, ""),
+        (LoadStep("a", normal_mm=0.005), 0.0, "by 0.005 mm into the tissue, less than a thousandth .* Is it in m"),
+        (LoadStep("a", normal_mm=3.005), 3.0, r"by 0.005 mm into the tissue, .* in mm\.$"),
         (LoadStep("a", normal_mm=9.9), 0.0, ""),
         (LoadStep("a", normal_mm=12.0), 3.0, ""),
         (LoadStep("a", normal_mm=12.0), 0.0, "Under a the plate would move by 12 mm .* past the bone, .* 10 mm"),

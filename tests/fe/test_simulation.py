@@ -148,6 +148,11 @@ def test_what_is_no_simulation_is_refused(simulation: fe.Simulation, tmp_path: P
     simulation.write(tmp_path)
     with pytest.raises(InputError, match="made on another mesh than the one given"):
         fe.Simulation.read(tmp_path, dome((2, 2, 2)))
+    curves = (tmp_path / "curve.csv").read_text()
+    (tmp_path / "curve.csv").write_text(curves + '"')
+    with pytest.raises(InputError, match=r"not the folder of a simulation, or a file in it is damaged .*curve\.csv"):
+        fe.Simulation.read(tmp_path)
+    (tmp_path / "curve.csv").write_text(curves)
     told = json.loads((tmp_path / "simulation.json").read_text())
     del told["outcome"]["in"]["plate_force_n"]
     (tmp_path / "simulation.json").write_text(json.dumps(told))

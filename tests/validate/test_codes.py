@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from dvc.errors import ImageFileError, MrstrainError
 from tests.blocks import block
 from validate import read_result
 from validate.rigid_parts import without_rigid_parts
-from validate.run_end import early_end
+from validate.run_end import _ends_of, early_end
 
 CODES = Path(__file__).with_name("codes.zip")
 with zipfile.ZipFile(CODES) as packed:
@@ -234,3 +235,29 @@ def test_without_log_and_deck_a_time_that_is_not_whole_or_a_file_without_its_end
     assert end is not None
     assert end.certain
     assert "no end in its log" in end.reason
+    with cut.with_suffix(".log").open("a") as log:  # the end of a long log counts, and is all that is read
+        log.write("a line of an iteration\n" * 20_000 + " N O R M A L   T E R M I N A T I O N\n")
+    assert early_end(cut) is None
+
+
+def test_a_long_log_is_not_read_whole(tmp_path: Path) -> None:
+    log = tmp_path / "model.log"
+    with log.open("wb") as sparse:
+        sparse.write(b"F O R   B I O M E C H A N I C S")
+        sparse.seek(1 << 31)
+        sparse.write(b" N O R M A L   T E R M I N A T I O N\n")
+    tracemalloc.start()
+    told = _ends_of(log)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert "N O R M A L" in told
+    assert "B I O M E C H A N I C S" in told
+    assert most < 1 << 20
+
+
+@pytest.mark.parametrize(("name", "told"), [("tet15", True), ("tet10", False), ("hex27", False)])
+def test_nodes_that_are_left_out_are_told(
+    folder: Path, caplog: pytest.LogCaptureFixture, name: str, told: bool
+) -> None:
+    read_mesh(folder / f"febio/{name}.xplt")
+    assert ("of each element of 15 nodes, the first 10 are taken, as of tetra10" in caplog.text) == told

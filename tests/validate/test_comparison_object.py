@@ -19,6 +19,7 @@ from dvc.worker import side_by_side
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
 from validate.report import area_rows, load_sections
+from validate.tables import read_curves
 
 GAMMAS = {"half": 0.2, "double": 0.8}
 
@@ -98,6 +99,14 @@ def test_a_folder_without_a_comparison_is_refused(folder: Path, tmp_path: Path) 
     (tmp_path / "location.csv").write_text("model,load\na,Load1\n")
     with pytest.raises(InputError, match=r"location\.csv has no column threshold"):
         Comparison.read(tmp_path)
+    whole = (folder / "curves.csv").read_text()
+    for damage in ('"', "1,2\n"):
+        (tmp_path / "curves.csv").write_text(whole + damage)
+        with pytest.raises(InputError, match=r"curves\.csv: the table of the comparison cannot be read .*Compare"):
+            read_curves(tmp_path)
+    (tmp_path / "curves.csv").write_text(re.sub(r"(\d)\.(\d)", r"\1..\2", whole))
+    with pytest.raises(InputError, match=r"curves\.csv: the table of the comparison is damaged .* Compare again"):
+        read_curves(tmp_path)
 
 
 def test_a_notebook_shows_the_answer_the_areas_and_the_curves(comparison: Comparison) -> None:

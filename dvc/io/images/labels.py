@@ -168,7 +168,7 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
         indices = np.stack(np.unravel_index(filled[start : start + _POINTS_AT_ONCE], own.shape), axis=-1)
         inside += int(np.count_nonzero(grid.contains(own.points_at(indices.astype(np.float64)))))
     if total == 0:
-        raise GeometryError(f"{what}: all voxels are 0.")
+        raise GeometryError(f"{what}: all voxels are 0. Choose another file.")
     share = inside / total
     boxes = f"Its grid: {own}. The image's grid: {grid}."
     if share < _NEEDED_OVERLAP:
@@ -246,7 +246,7 @@ def _integers(path: Path, what: str) -> tuple[Grid, IntArray, dict[int, int]]:
         raise InputError(f"{rule} the highest is {int(voxels.max())}. Renumber the labels.")
     labels = np.ascontiguousarray(voxels, dtype=np.int64)
     if not (counts := _counts(labels)):
-        raise InputError(f"{path}: the {what} is empty; all {labels.size} voxels are 0.")
+        raise InputError(f"{path}: the {what} is empty; all {labels.size} voxels are 0. Choose another file.")
     return grid, labels, counts
 
 

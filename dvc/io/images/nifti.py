@@ -94,7 +94,9 @@ def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
     if min(sizes) < 1:
         raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
     if len(sizes) < 3:
-        raise ImageFileError(f"{path}: the image is {len(sizes)}D, {sizes} voxels; a 3D image is needed.")
+        raise ImageFileError(
+            f"{path}: the image is {len(sizes)}D, {sizes} voxels; a 3D image is needed. Choose a volume."
+        )
     if len(sizes) > 4:
         raise ImageFileError(
             f"{path}: the file is {len(sizes)}D, {sizes} (vectors or tensors); a 3D scalar image is needed."

@@ -58,7 +58,7 @@ def read_image(
     if min(grid.shape) < _MIN_SLICES:
         raise ImageFileError(
             f"{path}: the image has {' x '.join(map(str, grid.shape))} voxels. Strain in three dimensions needs at "
-            f"least {_MIN_SLICES} slices along each axis."
+            f"least {_MIN_SLICES} slices along each axis. Choose a volume."
         )
     with np.errstate(over="ignore"):  # beyond single precision: infinite, and refused below
         values = np.ascontiguousarray(voxels, dtype=np.float32)
@@ -75,7 +75,9 @@ def read_image(
         values = np.where(finite, values, np.float32(np.nan))
     low = np.nanmin(values)
     if low == np.nanmax(values):
-        raise ImageFileError(f"{path}: the image is constant (all voxels are {float(low):g}); it cannot be registered.")
+        raise ImageFileError(
+            f"{path}: the image is constant (all voxels are {float(low):g}); it cannot be registered. Export it again."
+        )
     return Image(grid, values)
 
 

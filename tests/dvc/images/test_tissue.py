@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter
 
-from dvc.images.tissue import _closed, _ellipsoid, within
+from dvc.images.image import Grid, Image
+from dvc.images.tissue import _closed, _ellipsoid, tissue_mask, within
 
 
 @pytest.mark.parametrize("radius", [(2, 2, 2), (3, 1, 0), (5, 4, 2), (0, 0, 0)])
@@ -27,3 +28,15 @@ def test_a_margin_is_that_of_a_distance_transform(spacing: tuple[float, float, f
     inside = np.concatenate([inside, np.zeros((23, 12, 31), dtype=bool)], axis=1)
     away_mm = distance_transform_edt(~inside, sampling=spacing)
     assert np.array_equal(within(inside, np.array(spacing), margin), away_mm <= margin)
+
+
+@pytest.mark.parametrize("offset", [1e4, 1e6, -1e6])
+def test_the_body_is_found_whatever_the_images_zero(offset: float) -> None:
+    """Beside 1e6 numbers of 32 bits are 1/16 apart, and 256 bins of a histogram over 10 of them are narrower."""
+    body = np.zeros((24, 20, 22), dtype=bool)
+    body[5:19, 4:16, 6:17] = True
+    values = np.where(body, 8.0, 1.0) + np.random.default_rng(4).normal(0.0, 0.3, body.shape)
+    grid = Grid(body.shape, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    found, expected = (tissue_mask(Image(grid, values + zero)).inside for zero in (offset, 0.0))
+    assert expected[body].all()
+    assert np.count_nonzero(found ^ expected) < 0.01 * np.count_nonzero(expected)

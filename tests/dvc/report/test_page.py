@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import hashlib
 import io
 import re
 from html.parser import HTMLParser
@@ -94,8 +95,28 @@ def test_nothing_is_fetched(html: str) -> None:
         for key in ("src", "href"):
             value = attributes.get(key)
             assert value is None or value.startswith(("data:image/webp;base64,", "#"))
-    policy = [a["content"] for a in page.all("meta") if a.get("http-equiv") == "Content-Security-Policy"]
-    assert policy == ["default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"]
+
+
+def policy_of(html: str) -> dict[str, list[str]]:
+    """What a page's content security policy allows, by directive."""
+    (policy,) = [a["content"] for a in Page(html).all("meta") if a.get("http-equiv") == "Content-Security-Policy"]
+    parts = [part.split() for part in str(policy).split("; ")]
+    assert html.index("Content-Security-Policy") < min(html.index(tag) for tag in ("<script", "<style", "<body"))
+    return {name: allowed for name, *allowed in parts}
+
+
+def hashed(content: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
+
+
+def test_the_policy_names_the_pages_own_scripts_and_style_by_their_hashes(html: str) -> None:
+    scripts, styles = (re.findall(f"<{tag}>(.*?)</{tag}>", html, re.S) for tag in ("script", "style"))
+    assert policy_of(html) == {
+        "default-src": ["'none'"], "base-uri": ["'none'"], "form-action": ["'none'"], "img-src": ["data:"],
+        "style-src": [hashed(styles[0])], "script-src": [hashed(scripts[0])],
+    }  # fmt: skip
+    assert (len(scripts), len(styles)) == (1, 1)
+    assert not any("style" in attributes for _, attributes in Page(html).tags)
 
 
 def test_links_of_the_contents_lead_to_the_parts(html: str) -> None:
@@ -161,6 +182,9 @@ def test_a_volume_is_held_once_for_all_its_viewers(tmp_path: Path) -> None:
     np.testing.assert_allclose(held.get_fdata(), values, atol=0.5 * 119.0 / 125 + 1e-6)
     library = gzip.decompress(base64.b64decode(re.search(r'id="niivue">([^<]+)<', page)[1]))
     assert b"Niivue" in library
+    page_scripts = re.findall("<script>(.*?)</script>", page, re.S)
+    allowed = [hashed(one) for one in (*page_scripts, library.decode())]
+    assert policy_of(page)["script-src"] == [*allowed, "'wasm-unsafe-eval'"]
     assert len(page) < 1_500_000
 
 
@@ -233,7 +257,7 @@ def test_a_picture_fades_to_those_beneath_it(tmp_path: Path) -> None:
     page = Page((tmp_path / "r.html").read_text())
     images = [(a["alt"], a.get("class"), a.get("style")) for a in page.all("img")]
     assert images == [
-        ("unloaded, Load1", None, None), ("loaded, registered, Load1", "over", "opacity: 0"),
+        ("unloaded, Load1", None, None), ("loaded, registered, Load1", "over faded", None),
         ("Strain, Load1", "over", None), ("Curves, Load1", None, None),
     ]  # fmt: skip
     assert [(a["type"], a["value"]) for a in page.all("input")] == [("range", "0"), ("range", "100")]

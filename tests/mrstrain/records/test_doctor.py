@@ -68,7 +68,52 @@ def test_a_rival_of_our_names_is_refused_wherever_it_lies(
     assert title in said
     assert f"package {package!r} has the same name as one of mrstrain" in said
     assert "environment of its own" in said
-    assert ("is found in" in said) == (first == "theirs")
+    assert "found in" not in said  # once is enough
+
+
+def told_by(path: list[Path], code: str) -> str:
+    """The last line of a fresh interpreter's error with these folders first on its path; empty where there is none."""
+    code = f"import sys; sys.path[:0] = {[str(p) for p in path]!r}\n{code}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=path[-1])
+    assert bool(done.returncode) == bool(done.stderr)
+    return done.stderr.strip().rpartition("\n")[2]
+
+
+USES = ["import dvc", "from dvc import read_image", "from dvc.errors import InputError", "import fe; fe.LoadStep"]
+COMMANDS = ["import mrstrain; mrstrain.register", "from mrstrain import compare"]
+
+
+@pytest.mark.parametrize("code", [*USES, *COMMANDS])
+def test_data_version_control_is_refused_when_a_package_is_imported(tmp_path: Path, code: str) -> None:
+    path = [ROOT, install(tmp_path, "dvc", "dvc", "3.55.2")]
+    said = told_by(path, code)
+    assert "ImportError" in said or "ForeignPackageError" in said
+    assert "Data Version Control" in said
+    assert "3.55.2 is installed in" in said
+    assert said.endswith("environment of its own: python -m venv mrstrain-env, and install it there.")
+    assert told_by([ROOT], code) == ""
+
+
+@pytest.mark.parametrize("code", COMMANDS)
+def test_data_version_control_is_refused_where_theirs_is_imported(tmp_path: Path, code: str) -> None:
+    said = told_by([install(tmp_path, "dvc", "dvc"), ROOT], code)
+    assert "Data Version Control" in said
+
+
+@pytest.mark.parametrize("given", [(), ("doctor",), ("register", "a.nii"), ("--help",)])
+@pytest.mark.parametrize("first", ["ours", "theirs"])
+def test_the_command_refuses_data_version_control_in_a_sentence(
+    tmp_path: Path, given: tuple[str, ...], first: str
+) -> None:
+    path = [ROOT, install(tmp_path, "dvc", "dvc")]
+    path = path if first == "ours" else path[::-1]
+    code = f"import sys; sys.path[:0] = {[str(p) for p in path]!r}; from mrstrain.__main__ import main; main()"
+    command = [sys.executable, "-P", "-c", code, *given]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("mrstrain: The distribution dvc (Data Version Control) 3.1 is installed")
+    assert "environment of its own" in " ".join(done.stderr.split())
+    assert len(done.stderr.splitlines()) <= 3
 
 
 def test_any_other_package_that_shadows_ours_is_refused(tmp_path: Path) -> None:

@@ -9,9 +9,10 @@ import shutil
 import pytest
 
 from dvc.errors import InputError
-from mrstrain.studies.cohort import cohort
+from mrstrain.studies.cohort import _areas, cohort
 from mrstrain.studies.ledger import StageRecord
 from tests.mrstrain.studies.test_run import change
+from validate import ALL
 
 
 def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path):
@@ -45,3 +46,23 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
     ]
     with pytest.raises(InputError, match="different names"):
         cohort([places[0], places[0]], out=tmp_path / "cohort")
+
+
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        (lambda text: text.replace("akrami", '"akrami', 1), "unexpected end of data"),
+        (lambda text: text.replace("share", "shore", 1), "'share'"),
+        (lambda text: text[: text.rindex(",")], "cells, but the header has"),
+        (lambda text: re.sub(r"\d\.\d+", "1.2.3", text), "could not convert"),
+    ],
+)
+def test_a_damaged_table_of_areas_is_named(tmp_path, damage, why):
+    place = tmp_path / "comparison" / "areas.csv"
+    place.parent.mkdir()
+    table = f"model,load,tissue,ml,share,estimate_ml\nakrami,Load1,{ALL},1.5,0.1,nan\nakrami,Load2,{ALL},1.5,0.1,nan\n"
+    place.write_text(table)
+    assert [row["load"] for row in _areas(tmp_path)] == ["Load1", "Load2"]
+    place.write_text(damage(table))
+    with pytest.raises(InputError, match=rf"areas\.csv: .* is damaged \(.*{why}.*\). Compare again: mrstrain run"):
+        _areas(tmp_path)

@@ -73,7 +73,7 @@ def test_a_study_of_ones_own_is_not_touched(tmp_path):
 
 def test_changes_to_its_study_file_are_kept(folder):
     _make(folder, 1, False, None)
-    changed = (folder / "study.toml").read_text().replace('"luboz", ', "")
+    changed = (folder / "study.toml").read_text().replace('"erdemir", ', "")
     (folder / "study.toml").write_text(changed)
     _make(folder, 1, False, None)
     assert (folder / "study.toml").read_text() == changed
@@ -103,9 +103,9 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     assert "Load4 0.022 of 0.44" in lines[1]
     assert lines[2:4] == ["All loads: trebbi 2.5", "Best match over all loads (area metric): trebbi."]
     assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
-    outcomes["simulate luboz"] = ended("simulate luboz", "luboz, Load1: ONLY 75% of the load", complete=False)
+    outcomes["simulate erdemir"] = ended("simulate erdemir", "erdemir, Load1: ONLY 75% of the load", complete=False)
     lines = _summary(errors, StudyRun(study, outcomes))
-    assert lines[4] == "simulate luboz: in part. luboz, Load1: ONLY 75% of the load"
+    assert lines[4] == "simulate erdemir: in part. erdemir, Load1: ONLY 75% of the load"
     assert lines[5].startswith("Report: ")
 
 

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
+import subprocess
+import sys
 import time
 from concurrent.futures import Future
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import pytest
+from filelock import FileLock
 
 from dvc.errors import InputError, WorkerError
+from dvc.threads import usable_cores
+from mrstrain.records.progress import NOTE
 from mrstrain.studies import cluster, ledger, stages
 from mrstrain.studies.cluster import StageRunner, _Call, _run
 from mrstrain.studies.ledger import Ledger
@@ -22,6 +30,10 @@ from mrstrain.studies.run import _log
 from mrstrain.studies.stages import StageResult
 from tests.mrstrain.studies import test_pipeline
 from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
+from tests.processes import wait_for
+
+if sys.platform != "win32":
+    import resource
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
@@ -71,14 +83,58 @@ def ended_by(failure: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(log_event=lambda *_: None))
     monkeypatch.setattr(stages, "mesh", failing)
-    return _run("topic", _Call("mesh", "mesh", {}, str(folder / "lock"), 0.0))[0]
+    return _run("topic", _Call("mesh", "mesh", {}, str(folder / "lock"), 0.0, 0.0))[0]
 
 
-def test_memory_that_runs_out_counts_as_a_process_that_died(tmp_path, monkeypatch):
-    ended = ended_by(MemoryError("Unable to allocate 40 GiB"), tmp_path, monkeypatch)
+@pytest.mark.parametrize(
+    "lack",
+    [
+        MemoryError("Unable to allocate 40 GiB"),
+        ImportError("/lib/_core.so: failed to map segment from shared object"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+        RuntimeError("can't start new thread"),
+    ],
+)
+def test_memory_that_runs_out_counts_as_a_process_that_died(tmp_path, monkeypatch, lack):
+    """Each of these ended a stage of a study whose address space was limited."""
+    ended = ended_by(lack, tmp_path, monkeypatch)
     assert isinstance(ended, WorkerError)
-    assert "The memory ran out (Unable to allocate 40 GiB)" in str(ended)
+    assert f"The memory ran out ({str(lack).removeprefix('/lib/')})" in str(ended)
     assert "fewer --workers" in str(ended)
+
+
+@pytest.mark.parametrize("died", ["", "It died."])
+def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, died):
+    """A comparison, which starts a process for each core, then needs two thirds of its memory on two."""
+    cores = list[int]()
+    monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(log_event=lambda *_: None))
+    monkeypatch.setattr(stages, "compare", lambda tell: cores.append(usable_cores()))
+    _run("topic", _Call("compare", "compare", {}, str(tmp_path / "lock"), 0.0, 0.0, died))
+    assert cores == [1 if died else usable_cores()]
+
+
+@pytest.mark.full_size
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+@pytest.mark.parametrize(("mib", "ends"), [(800, 2), (1120, 1)])
+def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, ends):
+    """Address space for the command itself is lacking, then for the libraries of its stages."""
+    shutil.copytree(images, tmp_path / "study")
+    told = subprocess.run(
+        [sys.executable, "-m", "mrstrain", "run", str(tmp_path / "study"), "--workers", "2"],
+        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_AS, (mib << 20, mib << 20)),
+        capture_output=True, text=True, check=False, timeout=500,
+    )  # fmt: skip
+    said = told.stdout + told.stderr
+    assert told.returncode == ends
+    assert "The memory ran out" in said
+    assert "fewer --workers" in said.replace("\n", " ")
+    assert "error in mrstrain" not in said
+    assert "Traceback" not in said
+    if ends == 1:
+        log = (tmp_path / "study" / "results" / "study.log").read_text()
+        assert re.search(
+            r"mesh: FAILED .* The memory ran out .* It was tried twice; by the estimate it needs 1\.5 GiB", log
+        )
 
 
 class Machine:
@@ -101,23 +157,109 @@ class Machine:
         future.set_result((WorkerError("It died.") if dies else StageResult((f"{call.name} done",)), 1.0))
         return future
 
+    def nthreads(self) -> dict[str, int]:
+        return {"tcp://a": 1, "tcp://b": 1}
 
+    def restart_workers(self, workers: list[str], **_: object) -> None:
+        self.begun.append(f"restarted {len(workers)}")
+
+
+@pytest.mark.parametrize("alone", [True, False])
 @pytest.mark.parametrize("deaths", [1, 2])
-def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path, deaths):
+def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path, deaths, alone):
+    """In workers that were started anew, unless others may use them."""
     machine = Machine(big=deaths)
-    runner = StageRunner(machine, lambda *_: None)
+    runner = StageRunner(machine, lambda *_: None, SimpleNamespace() if alone else None)
     for name in ("big", "small", "other"):
-        runner.begin(name, "mesh", {}, tmp_path / "lock")
+        runner.begin(name, "mesh", {}, tmp_path / "lock", gib=2.34)
     ended = {}
     while runner.busy:
         name, outcome, _ = runner.next()
         ended[name] = outcome
         if name == "small":
             runner.begin("next", "mesh", {}, tmp_path / "lock")
-    assert machine.begun == ["big", "small", "other", "next", "big"]
+    assert machine.begun == ["big", "small", "other", "next", *["restarted 2"] * alone, "big"]
     assert list(ended) == ["small", "other", "next", "big"]
-    expected = "It died. It was tried twice." if deaths == 2 else "This was computed at the second attempt. It died."
+    expected = (
+        "It died. It was tried twice; by the estimate it needs 2.3 GiB of memory."
+        if deaths == 2
+        else "This was computed at the second attempt. It died."
+    )
     assert expected in (ended["big"] if deaths == 2 else ended["big"].lines)
+
+
+def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, monkeypatch):
+    """It waits for a lock that is never free, in a worker that runs the next stage after that."""
+    told = list[tuple[str, str, float]]()
+    monkeypatch.setattr(cluster, "_LOOK_EVERY_S", 0.2)
+    monkeypatch.setattr(cluster, "_SILENT_S", 4.0)
+    monkeypatch.setattr(cluster, "_NAME_EVERY_S", 2.0)
+    with (
+        FileLock(tmp_path / "held"),
+        cluster.cluster(lambda *event: told.append(event), [tmp_path], workers=1) as runner,
+    ):
+        runner.begin("hangs", "mesh", {}, tmp_path / "held", 0.01)
+        runner.begin("next", "no_stage", {}, tmp_path / "lock", 0.0)
+        wait_for(lambda: told)
+        assert told == [("hangs", "begun", 0.0)]
+        (worker,) = runner._client.nthreads()
+        (below,) = runner._client.run(lambda: subprocess.Popen(["sleep", "600"]).pid).values()
+        # Without it, a machine that wakes up, and a clock that is set, end every worker.
+        assert runner._client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.worker_ttl) is None
+        name, outcome, seconds = runner.next()
+        assert (name, round(seconds)) == ("hangs", 4)
+        assert "did not go on for 4 s and was ended" in outcome
+        assert "Run the study again" in outcome
+        ((_, sentence, _),) = [event for event in told if event[0] == NOTE]
+        assert sentence.startswith("hangs has not gone on for 2 s. After 4 s it is ended, and the others go on")
+        name, outcome, _ = runner.next()
+        assert name == "next"
+        assert "has no attribute 'no_stage'" in outcome
+        assert worker not in runner._client.nthreads()
+        wait_for(lambda: not psutil.pid_exists(below), limit_s=30.0)
+        assert not runner.busy
+
+
+@pytest.mark.parametrize(("to_end_s", "limit_s"), [(0.0, 3600.0), (300.0, 3600.0), (5000.0, 50_000.0)])
+def test_a_long_stage_may_be_silent_for_longer(to_end_s, limit_s):
+    """By what the study is expected to take from it on: a machine that is ten times as slow loses nothing."""
+    assert _Call("mesh", "mesh", {}, "lock", to_end_s, 0.0).may_be_silent_s == limit_s
+
+
+def test_a_stage_that_tells_something_now_and_then_does_not_hang(tmp_path, monkeypatch):
+    runner = StageRunner(Machine(), lambda *_: None)
+    monkeypatch.setattr(runner._client, "submit", lambda *_, **__: Future())
+    runner.begin("slow", "mesh", {}, tmp_path / "lock")
+    assert runner._hung() is None  # it has not begun
+    for n in range(3):
+        runner._tell("slow", "registering", 0.1 * n)
+        assert not any(runner._hung() for _ in range(3600))
+    runner._tell("slow", "registering", 0.2)  # as a worker tells of a process that hangs
+    assert runner._hung() is not None
+
+
+def test_a_worker_without_memory_for_a_stage_counts_as_a_process_that_died(tmp_path, monkeypatch):
+    future = Future()
+    future.status = "error"
+    future.set_exception(RuntimeError("can't start new thread"))
+    runner = StageRunner(Machine(), lambda *_: None)
+    monkeypatch.setattr(runner._client, "submit", lambda *_, **__: future)
+    runner.begin("mesh", "mesh", {}, tmp_path / "lock")
+    _, outcome, _ = runner.next()
+    assert outcome.startswith("The memory ran out (can't start new thread). Free memory")
+    assert "tried twice" in outcome
+
+
+def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):
+    """Dask starts a thread for it, and where memory is short there is none: a run waited for ever."""
+    monkeypatch.setattr(Future, "add_done_callback", lambda *_: None)
+    monkeypatch.setattr(cluster, "_LOOK_EVERY_S", 0.01)
+    machine = Machine(big=1)
+    runner = StageRunner(machine, lambda *_: None)
+    runner.begin("big", "mesh", {}, tmp_path / "lock")
+    runner.begin("small", "mesh", {}, tmp_path / "lock")
+    assert [runner.next()[0] for _ in range(2)] == ["small", "big"]
+    assert not runner.busy
 
 
 def test_results_that_are_removed_under_a_run_are_not_recorded(folder, monkeypatch):

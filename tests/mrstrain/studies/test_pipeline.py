@@ -29,7 +29,9 @@ class Here:
     def busy(self) -> bool:
         return bool(self._ended)
 
-    def begin(self, name: str, function: str, arguments: dict, lock: Path, urgency: float = 0.0) -> None:
+    def begin(
+        self, name: str, function: str, arguments: dict, lock: Path, to_end_s: float = 0.0, gib: float = 0.0
+    ) -> None:
         self.ran.append(name)
         out = Path(arguments["out"])
         if name in self.failing:
