@@ -49,6 +49,14 @@ class Verdict:
         """The level as people read it: "Trust", "Use with care", "Do not trust"."""
         return _WORDS[self.level]
 
+    def among(self, load: str) -> "Verdict":
+        """The same verdict for a list of several registrations: each reason names its load.
+
+        >>> Verdict("distrust", ("It folds.",)).among("Load1").reasons
+        ('Load1, registration (Do not trust): It folds.',)
+        """
+        return Verdict(self.level, tuple(f"{load}, registration ({self.words}): {reason}" for reason in self.reasons))
+
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
         return {"level": self.level, "reasons": list(self.reasons)}

@@ -54,7 +54,7 @@ def _bone(inputs: StudyInputs, names: Sequence[str], read: Read) -> dict[str, ob
             return {"bone": text}
         if text in files:
             return {"bone_mask": text}
-        raise ValueError(f"there are {', '.join([*names, *files])}")
+        raise ValueError(f"choose one of {', '.join([*names, *files])}")
 
     usual = inputs.bone_mask or next(iter(likely), "later")
     told = _asked(f"Bone: its label ({', '.join(names) or 'none'}) or the file of its mask", usual, known, read)

@@ -94,7 +94,7 @@ class Series:
         """Write the provenance of a series and its report, one self-contained page."""
         told = [case.section for case in cases]
         told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]
-        verdict = worst([s.verdict for s in told if s.verdict is not None])
+        verdict = worst([s.verdict.among(s.title) if told[1:] else s.verdict for s in told if s.verdict is not None])
         write_json(out / PROVENANCE, record)
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
         title, about = "Strain from MR image pairs", _images(record, cases)

@@ -218,6 +218,6 @@ def _sections(
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for name, one in ran.items():
         failed = tuple(f"Incomplete: {outcome}" for outcome in one.outcomes.values() if outcome.record is None)
-        verdicts = list(one.verdicts.values())
+        verdicts = [verdict.among(load) for load, verdict in one.verdicts.items()]
         sections.append(Section(name, worst(verdicts) if verdicts else None, paragraphs=failed))
     return sections

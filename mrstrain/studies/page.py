@@ -43,7 +43,9 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     answer = answer_of(of_each, compared[:1], study.out / COMPARISON)
     others = [*against_truth, *compared[1:], *registered, _stages(outcomes)]
     sections = [*answer, *(replace(section, folded=True) for section in others)]
-    verdict = _verdict([one for of in of_loads.values() for one in of.verdicts], compared)
+    verdict = _verdict(
+        [s.verdict.among(s.title) for of in of_loads.values() for s in of.sections if s.verdict], compared
+    )
     write_report(path, study.study.name, verdict, sections, closing, record_lines(record), notes=_incomplete(outcomes))
 
 

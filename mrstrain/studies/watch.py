@@ -18,7 +18,8 @@ from mrstrain.studies.time_left import TimeLeft
 
 OnReport = Callable[[Path], object]
 OnEnd = Callable[[Study, Mapping[str, StageOutcome]], object]
-_PAGE_EVERY_S = 3.0
+_PAGE_EVERY_S = 3.0  # where something has changed
+_PAGE_AT_LEAST_EVERY_S = 60.0  # its time of day shows that the run goes on
 _UNENDED = 0.999  # of the whole: only what has ended is told as 1
 
 
@@ -51,8 +52,8 @@ class Report:
         state, when = f"{len(outcomes)} of {len(names)} stages are done", f"{datetime.now():%H:%M:%S}"
         told = (
             f"Interrupted at {when}: {state}. mrstrain run resumes it." if interrupted
-            else f"In progress, at {when}: {state}, about {duration(left_s)} left. This page reloads itself. If "
-            "the time of day does not change any more, the run was killed; mrstrain run resumes it."
+            else f"In progress, at {when}: {state}, about {duration(left_s)} left. This page is renewed every "
+            "minute, and reloads itself. If it is older, the run was killed; mrstrain run resumes it."
         )  # fmt: skip
         write_page_in_progress(self.path, self.study, names, outcomes, under_way, told, ended=interrupted)
         self._show(outcomes[name] for load in self.study.loads if (name := f"register {load}") in outcomes)
@@ -141,8 +142,13 @@ class Watch:
         thread.join()
 
     def _keep_up(self) -> None:
+        renewed = time.monotonic()
         while not self._stop.wait(_PAGE_EVERY_S):
             with self._lock:
+                if time.monotonic() - renewed >= _PAGE_AT_LEAST_EVERY_S:
+                    renewed = time.monotonic()
+                    for name in self.left.under_way:
+                        self._change(name)
                 changed, self._changed = self._changed, set()
                 self._tell_all()  # stages that hang tell nothing
             self._write(changed)

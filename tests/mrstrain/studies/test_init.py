@@ -223,7 +223,7 @@ def test_answers_stand_in_the_study_file(tmp_path, tiny_pair, capsys):
     ]  # fmt: skip
     assert asked[0].endswith("or the file of its mask [bone]: ")
     told = capsys.readouterr().out
-    assert "'heel': there are bone, fat" in told
+    assert "'heel': choose one of bone, fat" in told
     assert "'-5': the normal force presses, so it is positive." in told
     assert "'abc': a number is needed" in told
     assert "'1 0': three numbers are needed" in told

@@ -24,6 +24,7 @@ from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import TABLE, write_errors
 from phantoms import TissueError
 from tests.mrstrain.comparison.test_methods import measured
+from validate.comparison import verdict_on
 
 STUDY = """
 [study]
@@ -104,7 +105,12 @@ def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(stu
 def test_a_registration_that_is_not_to_be_trusted_heads_the_report(study: Study) -> None:
     folded = StageResult((), (Section("Load2", Verdict("distrust", ("It folds.",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=folded)))
-    assert told.startswith("Heel Do not trust It folds.")
+    assert told.startswith("Heel Do not trust Load2, registration (Do not trust): It folds.")
+    # the comparison has the same reason, which is given once
+    poor = Verdict("caution", ("The images agree poorly.",))
+    doubted = ended(study, register_Load1=StageResult((), (Section("Load1", poor),)), register_Load2=SOUND,
+                    compare=StageResult((), (Section("Models", verdict_on({"Load1": poor})),)))  # fmt: skip
+    assert head(page_of(study, doubted)).count("The images agree poorly.") == 1
     # a comparison made of it before is not what is there now
     compared = StageResult((), (Section("Models", Verdict("distrust", ("It folds.",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=SOUND, compare=compared)))

@@ -108,6 +108,15 @@ def test_the_report_grows_while_the_study_runs(seen: Seen) -> None:
     assert seen.shown == [seen.path]  # once
 
 
+def test_the_page_of_a_long_stage_is_renewed(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watching, "_PAGE_AT_LEAST_EVERY_S", 0.3)
+    with seen.watch.reporting():
+        seen.watch.told("simulate trebbi", "begun", 0.0)
+        seen.page_with("under way", "renewed every minute")
+        seen.path.unlink()
+        seen.page_with("under way")
+
+
 def test_an_interrupted_run_says_so_and_does_not_reload(seen: Seen) -> None:
     seen.end("register Load1", MEASURED)
     with pytest.raises(KeyboardInterrupt), seen.watch.reporting():

@@ -1,0 +1,145 @@
+"""The report on a wide screen, a tablet and a telephone: it fits, is legible, and a screen reader finds its way."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.images.image import Grid
+from dvc.report.page import Picture, Section, Table, Viewer, Volume, write_report
+from dvc.trust.verdict import Verdict
+from tests.browser import CHROMIUM, Tab, browser
+from tests.dvc.report.test_page import png
+
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")
+
+WIDTHS = (1400, 800, 400)  # CSS pixels
+UNFOLD = "document.querySelectorAll('main details').forEach((part) => { part.open = true; })"
+TOO_WIDE = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+PALE = """(() => {
+  const channels = (colour) => colour.match(/[\\d.]+/g).map(Number);
+  const luminance = (colour) => {
+    const [r, g, b] = channels(colour).map((c) => (c /= 255) <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const ground = (node) => {
+    for (; node; node = node.parentElement) {
+      const colour = getComputedStyle(node).backgroundColor, alpha = channels(colour)[3] ?? 1;
+      if (alpha > 0) return colour;
+    }
+    return "rgb(255, 255, 255)";
+  };
+  const texts = document.createTreeWalker(document.querySelector(".page"), NodeFilter.SHOW_TEXT), pale = [];
+  let seen = 0;
+  while (texts.nextNode()) {
+    const words = texts.currentNode.textContent.trim(), node = texts.currentNode.parentElement;
+    if (!words || !node.checkVisibility()) continue;
+    seen += 1;
+    const [light, dark] = [luminance(getComputedStyle(node).color), luminance(ground(node))].sort((a, b) => b - a);
+    const contrast = (light + 0.05) / (dark + 0.05), size = parseFloat(getComputedStyle(node).fontSize);
+    if (contrast < 4.5 || size < 12) pale.push(`${words}: contrast ${contrast.toFixed(2)}, ${size} px`);
+  }
+  return seen > 20 ? pale : ["hardly any text is seen"];
+})()"""
+"""Texts with less contrast than WCAG 2.2 asks for (AA, 1.4.3), or in small type."""
+HEADINGS = (
+    """[...document.querySelectorAll("main h1, main h2, main h3, main h4")].map((one) => Number(one.tagName[1]))"""
+)
+UNNAMED = """[
+  ...[...document.querySelectorAll("img")].filter((one) => !one.alt.trim()),
+  ...[...document.querySelectorAll("input")].filter((one) => !one.labels.length || !one.labels[0].textContent.trim()),
+  ...[...document.querySelectorAll("button, summary, a")].filter((one) => !one.textContent.trim()),
+  ...[...document.querySelectorAll("th")].filter((one) => !one.scope),
+].map((one) => one.outerHTML.slice(0, 80))"""
+NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
+
+
+@pytest.fixture(scope="module")
+def tab() -> Iterator[Tab]:
+    with browser() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of everything that a page can hold: three verdicts, a wide table, pictures that fade, a viewer."""
+    grid = Grid((12, 14, 16), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    values = np.random.default_rng(0).random(grid.shape)
+    image, strain = Volume.image("Load0", grid, values, 1.0), Volume.overlay("max. shear", grid, values, 1.0)
+    columns = ("tissue", *(f"a long name of column {n}" for n in range(12)))
+    table = Table("Strain", columns, (("fat", *(0.1 * n for n in range(12))),), "A note.", (("all", *(None,) * 12),))
+    picture = Picture("Strain", "How to read it.", png(), (("unloaded", png()), ("Load1, registered", png())))
+    doubtful = Verdict("caution", ("Bone moves by 0.4 mm (use with care above 0.3 mm).",))
+    sections = [
+        Section("Load1", Verdict("trust"), (table,), (picture,), ("What was found.",), summary=table),
+        Section("Load2", doubtful, folded=True),
+        Section("Load3", Verdict("distrust", ("The deformation folds.",)), folded=True),
+        Section("In space", folded=True, viewers=(Viewer("Strain", "To turn.", image, (strain,)),)),
+    ]
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    record = {"seed": "1", "version: " + "long-name-" * 12: "x" * 200}
+    write_report(path, "A heel under three loads", doubtful, sections, [Section("Terms")], record, notes=["A note."])
+    return path
+
+
+def opened(tab: Tab, page: Path, width: int) -> None:
+    """The page in a window of a width, as a person first sees it."""
+    screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 1000}
+    tab.call("Emulation.setDeviceMetricsOverride", **screen)
+    tab.open(page)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_page_fits_and_its_text_is_legible(tab: Tab, page: Path, width: int, tmp_path: Path) -> None:
+    opened(tab, page, width)
+    assert tab.value("document.querySelector('.verdict').getBoundingClientRect().bottom") < 900
+    assert tab.value("document.getElementById('contents').open") == (width > 1088)  # the answer comes first
+    tab.value(UNFOLD)
+    assert tab.value(TOO_WIDE) <= 0
+    assert tab.value(PALE) == []
+    shot = base64.b64decode(tab.call("Page.captureScreenshot", captureBeyondViewport=True)["data"])
+    (tmp_path / f"report-{width}.png").write_bytes(shot)  # to be looked at
+    assert shot.startswith(b"\x89PNG")
+    assert tab.said == []
+
+
+def test_what_does_not_fit_or_is_pale_is_found(tab: Tab, page: Path) -> None:
+    opened(tab, page, 400)
+    tab.value("document.querySelector('main p').style.width = '500px'")
+    assert tab.value(TOO_WIDE) > 0
+    tab.value("document.querySelector('main > p').style.color = '#888888'")
+    (pale,) = tab.value(PALE)
+    assert pale.startswith("A note.: contrast 3.")
+
+
+def test_a_screen_reader_finds_its_way(tab: Tab, page: Path) -> None:
+    opened(tab, page, 1400)
+    tab.value(UNFOLD)
+    levels = tab.value(HEADINGS)
+    assert levels.count(1) == 1
+    assert levels[0] == 1
+    assert all(below - above <= 1 for above, below in pairwise(levels))
+    assert tab.value(UNNAMED) == []
+    assert tab.value("document.documentElement.lang") == "en"
+    assert tab.value("document.querySelectorAll('main, nav[aria-label]').length") == 2
+
+
+def test_without_webgl_the_viewer_says_so_and_the_rest_stays(tab: Tab, page: Path) -> None:
+    opened(tab, page, 1400)
+    tab.value(f"{NO_WEBGL}; {UNFOLD}; document.querySelector('.viewer button').click()")
+    tab.wait_for("'state' in document.querySelector('.viewer').dataset")
+    assert tab.value("document.querySelector('.viewer').dataset.state") == "failed"
+    assert "WebGL 2" in tab.value("document.querySelector('.viewer button').textContent")
+    assert tab.value("document.querySelector('.stack img').complete")
+
+
+def test_it_prints_with_all_that_was_folded(tab: Tab, page: Path) -> None:
+    opened(tab, page, 1400)
+    printed = base64.b64decode(tab.call("Page.printToPDF", printBackground=False)["data"])
+    assert printed.startswith(b"%PDF")
+    assert tab.value("[...document.querySelectorAll('main details')].every((part) => part.open)")
