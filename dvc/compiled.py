@@ -21,7 +21,10 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """As `numba.njit`; a stored loop that is damaged is compiled again, and one that cannot be stored is used once."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
+        try:
+            kernel = numba.njit(**options)(function)
+        except RuntimeError:  # neither the package's folder nor the home folder can be written to
+            return numba.njit(**options | {"cache": False})(function)
         if (stored := getattr(kernel._cache, "_cache_file", None)) is not None:
             stored.__class__ = _CheckedFile
         return kernel

@@ -13,6 +13,7 @@ from dvc import TetMesh
 from dvc.arguments import check_fields, checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
+from dvc.file_names import refuse_as_file_name
 from dvc.mesh import repeated_rows
 from fe.elements import element as formulation
 from fe.materials import Materials
@@ -59,7 +60,8 @@ class LoadStep:
     Raises
     ------
     InputError
-        Unless exactly one of force and displacement is given along the normal, and at most one along the shear.
+        If the name cannot be the name of a file; unless exactly one of force and displacement is given along the
+        normal, and at most one along the shear.
     """
 
     name: str
@@ -70,6 +72,7 @@ class LoadStep:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        refuse_as_file_name("load", self.name)
         if (self.normal_n is None) == (self.normal_mm is None):
             raise InputError(f"{self.name}: give either the normal force or the plate displacement along the normal.")
         if self.shear_n is not None and self.shear_mm is not None:

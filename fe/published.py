@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from dvc.errors import InputError
+from dvc.file_names import refuse_as_file_name
 from fe.hyperelastic import OGDEN
 from fe.materials import MODES, Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 
@@ -251,6 +252,7 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
         if not tissues:
             raise InputError(f"{where}: the set '{name}' has no tissue; add a table such as [{name}.fat] with a 'law'.")
         materials = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
+        refuse_as_file_name("material set", name, where)
         sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(materials))
     if not sets:
         raise InputError(f"{where}: the file contains no material set.")

@@ -13,6 +13,7 @@ from dvc import LabelMap, TetMesh, Verdict
 from dvc.arguments import checked
 from dvc.atomic_files import whole_folder, write_json
 from dvc.errors import InputError
+from dvc.file_names import refuse_as_file_name
 from dvc.own_files import read_json
 from dvc.report.drawing import png_bytes
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
@@ -169,6 +170,9 @@ class Comparison:
         """
         if not self.loads:
             raise InputError("A comparison that was read from files has no fields to write; copy its folder instead.")
+        for of, names in (("load", self.coverage_ml), ("model", {n for one in self.loads for n in one.fields.models})):
+            for name in names:
+                refuse_as_file_name(of, name)
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         tables.remove_earlier(target, list(self.coverage_ml))

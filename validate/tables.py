@@ -14,6 +14,7 @@ from dvc import Image, StrainField, evaluate_on_grid, write_image, write_vectors
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_csv
 from dvc.errors import InputError
+from dvc.file_names import as_file_name
 from dvc.own_files import read_json, read_rows
 from dvc.report.drawing import figure_files
 from validate.agreement import Agreement, SkinDisplacement
@@ -124,7 +125,7 @@ def _rows(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
 def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
     """Remove the files of an earlier comparison, and its folders of loads that are no longer compared."""
     try:
-        earlier = list(read_json(folder / RECORD)["coverage_ml"])
+        earlier = [as_file_name(load) for load in read_json(folder / RECORD)["coverage_ml"]]
     except (OSError, ValueError, KeyError, TypeError):
         return
     pictures = (path for stem in OF_ALL_LOADS for path in figure_files(folder / stem))

@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
+from dvc.file_names import as_file_name
 from mrstrain.options import modelling
 from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFiles, Unit
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
@@ -24,15 +25,7 @@ def _seconds(minutes: float | None) -> float | None:
     return None if minutes is None else modelling.MINUTE_S * minutes
 
 
-def as_folder(text: str) -> str:
-    """The name unchanged; ValueError if it cannot be the name of a folder."""
-    unfit = any(c in '/\\:*?"<>|' or not c.isprintable() for c in text)
-    if unfit or not text or text != text.strip() or text[0] == ".":
-        raise ValueError("becomes the name of a folder: no slash, colon or quotes, and no dot at the beginning")
-    return text
-
-
-Name = Annotated[str, AfterValidator(as_folder)]
+Name = Annotated[str, AfterValidator(as_file_name)]
 
 
 class _Part(BaseModel):

@@ -5,7 +5,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -123,7 +123,8 @@ class Ledger:
             return None
         if record.checksum != record.sealed().checksum:
             return None  # damaged: the stage is run again
-        whole = all(state.is_that_of(self.out / name) for name, state in record.files.items())
+        own = all(_within(self.out / name, stage.gives) for name in record.files)  # or it was tampered with
+        whole = own and all(state.is_that_of(self.out / name) for name, state in record.files.items())
         return record if whole else None
 
     def clear(self, stage: Stage, reason: str = "", *, files: bool) -> None:
@@ -170,3 +171,9 @@ class Ledger:
 
     def _file(self, stage: Stage, ending: str) -> Path:
         return self.folder / f"{stage.name}{ending}"
+
+
+def _within(path: Path, places: Sequence[Path]) -> bool:
+    """Whether a path is one of these places or lies below one of them, however it is written."""
+    plain = Path(os.path.normpath(path))
+    return any(plain.is_relative_to(os.path.normpath(place)) for place in places)

@@ -12,7 +12,7 @@ from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
 from mrstrain.options.measurement import EngineOptions
 from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, PlateOptions, SimulationOptions
-from mrstrain.studies.file import Study, as_folder
+from mrstrain.studies.file import Study
 from validate import LEVELLED
 
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
@@ -179,10 +179,6 @@ def _on_mesh(
 
 def _simulation(study: Study, one: str) -> Stage:
     name = material_set(study.set_given(one)).name
-    try:
-        as_folder(name)
-    except ValueError as wrong:
-        raise InputError(f"The name of the material set '{name}' in {one} {wrong}.") from wrong
     steps = load_steps(study)
     arguments = {
         **study.models.narrowed(SimulationOptions).model_dump(), **study.plate.narrowed(PlateOptions).model_dump(),

@@ -6,7 +6,7 @@ import importlib.util
 import os
 from pathlib import Path
 
-import numba
+import numba.core.caching
 import pytest
 
 from dvc.compiled import njit
@@ -54,6 +54,13 @@ def test_a_damaged_one_is_compiled_again(module, ending, left, damage):
     assert hits(module) == 2
     if ending == "nbc":
         assert {path: path.read_bytes() for path in others} == others
+
+
+def test_where_nothing_can_be_stored_it_is_compiled_for_each_run(module, monkeypatch):
+    """A package folder and a home folder that are both read-only, as in many containers."""
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+    assert hits(module) == 0
+    assert not files(module, "nbi")
 
 
 def test_what_a_full_disk_does_not_take_is_used_as_it_is(module, monkeypatch):

@@ -13,6 +13,7 @@ import pytest
 
 from dvc.images.image import Grid, LabelMap
 from dvc.io.images.write import write_image, write_labels
+from tests.planted import plant_in_nifti
 
 STUDY = """
 [study]
@@ -65,6 +66,8 @@ def images(made_once, tiny_pair, small_pair) -> Path:
         write_image(folder / "Load0-again.nii.gz", tiny_pair.repeat)
         write_labels(folder / "tissues.nii.gz", tiny_pair.labels)
         write_labels(folder / "to_mesh.nii.gz", coarse(small_pair.labels))
+        for image in folder.glob("*.nii.gz"):
+            plant_in_nifti(image)  # a patient, whom no result may name
         (folder / "study.toml").write_text(STUDY)
 
     return made_once("study-images", fill)

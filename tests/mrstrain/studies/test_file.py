@@ -190,6 +190,19 @@ def test_a_set_whose_name_is_no_folder_is_refused(tmp_path):
         plan(read_study(written(tmp_path, WHOLE.replace('"luboz"', '"mine.toml"'))))
 
 
+@pytest.mark.parametrize("link", ["registration", "registration/Load1", "models/luboz", "comparison"])
+def test_results_that_a_link_would_take_elsewhere_are_refused(tmp_path, link):
+    elsewhere, study = tmp_path / "elsewhere", tmp_path / "study"
+    elsewhere.mkdir()
+    place = study / "results" / link
+    place.parent.mkdir(parents=True)
+    place.symlink_to(elsewhere, target_is_directory=True)
+    with pytest.raises(InputError, match=r"would write to .*elsewhere.*, which is not below the results folder"):
+        plan(read_study(written(study, WHOLE)))
+    place.unlink()
+    assert plan(read_study(study))
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

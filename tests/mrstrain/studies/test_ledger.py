@@ -9,7 +9,7 @@ import os
 import pytest
 
 from mrstrain.records.provenance import without_folders
-from mrstrain.studies.ledger import Ledger
+from mrstrain.studies.ledger import FileState, Ledger, StageRecord
 from mrstrain.studies.plan import Stage
 from tests.mrstrain.studies.test_pipeline import ran
 
@@ -35,6 +35,20 @@ def test_a_record_that_was_damaged_is_made_again(folder, right, wrong):
     assert right in told
     record.write_text(told.replace(right, wrong))
     assert ran(folder)[0] == ["register a", "compare"]
+    assert ran(folder)[0] == []
+
+
+@pytest.mark.parametrize("place", ["../elsewhere", "register_b", "{out}/../elsewhere"])
+def test_a_record_that_names_a_file_which_is_not_its_stages_own_is_not_believed(folder, place):
+    ran(folder)
+    (folder / "elsewhere").write_text("precious")
+    place = place.format(out=folder / "results")
+    file = folder / "results" / ".study" / "register a.json"
+    record = StageRecord.model_validate_json(file.read_bytes())
+    files = record.files | {place: FileState.of(folder / "results" / place)}
+    file.write_text(record.model_copy(update={"files": files}).sealed().model_dump_json())
+    assert ran(folder)[0] == ["register a", "compare"]
+    assert (folder / "elsewhere").read_text() == "precious"
     assert ran(folder)[0] == []
 
 

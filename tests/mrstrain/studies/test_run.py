@@ -31,6 +31,7 @@ from mrstrain.studies.file import read_study
 from mrstrain.studies.init import init
 from mrstrain.studies.plan import plan
 from mrstrain.studies.run import forecast, report, run, run_studies
+from tests.planted import PLANTED, planted_in
 from tests.processes import cluster_of_two, under_way, wait_for
 from tests.quick import QUICK
 
@@ -53,6 +54,13 @@ def change(study: Path, *changes: tuple[str, str]) -> None:
 def areas(study: Path) -> list[float]:
     with (study / "results" / "comparison" / "areas.csv").open() as file:
         return [float(row["ml"]) for row in csv.DictReader(file)]
+
+
+def test_no_result_names_the_patient_of_an_images_header(done):
+    folder, *printed = done
+    assert planted_in(folder / "results") == []
+    assert not any(word in text for word in PLANTED for text in printed)
+    assert {one.rpartition(": ")[2] for one in planted_in(folder)} == set(PLANTED)
 
 
 def test_every_result_is_there_and_the_report_tells_it(done):

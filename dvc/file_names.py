@@ -1,0 +1,31 @@
+"""Names of loads, material sets and models, which become names of files: none leads out of the folder of results."""
+
+from dvc.errors import InputError
+
+_MOST_BYTES = 200  # file systems take 255, of which endings need some
+_DEVICES = {"con", "prn", "aux", "nul"} | {f"{port}{n}" for port in ("com", "lpt") for n in "0123456789¹²³"}
+
+
+def as_file_name(text: str) -> str:
+    """The text unchanged; ValueError if it cannot name a file or a folder on every system.
+
+    >>> as_file_name("Load 1")
+    'Load 1'
+    """
+    unfit = any(c in '/\\:*?"<>|' or not c.isprintable() for c in text)
+    if unfit or not text or text != text.strip() or "." in (text[0], text[-1]):
+        raise ValueError("becomes the name of a folder: no slash, colon or quotes, and no dot at the beginning or end")
+    if text.partition(".")[0].strip().casefold() in _DEVICES:
+        raise ValueError("is the name of a device on Windows: choose another")
+    if len(text.encode(errors="replace")) > _MOST_BYTES:
+        raise ValueError(f"becomes the name of a folder: {_MOST_BYTES} bytes are the most")
+    return text
+
+
+def refuse_as_file_name(of: str, name: str, where: str = "") -> None:
+    """InputError if the name ``of`` something, such as a load, cannot name a file; ``where`` is the file it is in."""
+    try:
+        as_file_name(name)
+    except ValueError as wrong:
+        shown = name if len(name) <= _MOST_BYTES else f"{name[:40]}..."
+        raise InputError(f"{where and where + ': '}The name of the {of} {shown!r} {wrong}.") from wrong

@@ -1,0 +1,63 @@
+"""A name that becomes a file stays in the folder of results, on every system, wherever it comes from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import fe
+from dvc.errors import InputError
+from dvc.file_names import as_file_name
+from mrstrain.records.inputs import case_names
+from mrstrain.studies.file import read_study
+from validate.tables import RECORD, remove_earlier
+
+OUTSIDE = ("../x", "..", ".", "a/b", "/x", "C:x", "a\\b", "\\\\host\\x", "~/x/", "x\0y", "x\ny", "x\x1b[2J", "x\u202ey")
+ODD = ("", " x", "x ", "x.", ".x", "CON", "nul.txt", "Com1", "lpt³", "a" * 201, "<script>", "ü" * 101)
+
+
+@pytest.mark.parametrize("name", [*OUTSIDE, *ODD])
+def test_it_is_refused_wherever_it_is_given(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match=r"becomes the name of a folder|device on Windows"):
+        as_file_name(name)
+    with pytest.raises(InputError, match="The name of the load"):
+        fe.LoadStep(name, normal_n=1.0)
+    (tmp_path / "mine.toml").write_text(fe.as_toml(name, "", {"fat": fe.NeoHooke.of(mu_mpa=0.01, nu=0.49)}))
+    with pytest.raises(InputError, match=r"mine\.toml: The name of the material set"):
+        fe.read_material_sets(tmp_path / "mine.toml")
+
+
+@pytest.mark.parametrize("name", ["Load1", "Load 1, repeat", "Füße", "kräftig=140", "console", "com", "a.b", "a" * 200])
+def test_all_others_are_names(name: str) -> None:
+    assert as_file_name(name) == name
+    assert fe.LoadStep(name, normal_n=1.0).name == name
+
+
+@pytest.mark.parametrize(("file", "what"), [("..nii.gz", "folder"), ("con.nii.gz", "Windows"), ("a\nb.nii", "folder")])
+def test_an_image_whose_name_is_none_is_named(file: str, what: str) -> None:
+    with pytest.raises(InputError, match=what) as told:
+        case_names([Path("in") / file])
+    assert str(told.value).startswith(str(Path("in") / file))
+
+
+@pytest.mark.parametrize("name", ["../x", "/tmp/x", "CON", r"x\u0000y"])
+def test_a_load_of_a_study_file_is_named_with_its_line(tmp_path: Path, name: str) -> None:
+    text = f'[study]\nname = "a"\n[images]\nload0 = "a.nii"\nlabels = "b.nii"\n[loads."{name}"]\nimage = "c.nii"\n'
+    (tmp_path / "study.toml").write_text(text)
+    with pytest.raises(InputError, match=r"becomes the name of a folder|device on Windows"):
+        read_study(tmp_path)
+
+
+def test_a_comparison_removes_no_folder_that_its_record_names_elsewhere(tmp_path: Path) -> None:
+    for place in ("others/work", "out/Load1"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "fields.vtu").touch()
+    record = tmp_path / "out" / RECORD
+    for load in ("../others/work", str(tmp_path / "others" / "work")):
+        record.write_text(f'{{"coverage_ml": {{"{load}": 1.0}}}}')
+        remove_earlier(tmp_path / "out", [])
+        assert (tmp_path / "others" / "work" / "fields.vtu").exists()
+    record.write_text('{"coverage_ml": {"Load1": 1.0}}')
+    remove_earlier(tmp_path / "out", [])
+    assert not (tmp_path / "out" / "Load1").exists()
