@@ -137,6 +137,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--longest", type=float, help="s until a kill at most; by default 0.7 of a run without a break")
     parser.add_argument("--work", type=Path, required=True, help="made, and filled; must not exist")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
@@ -148,12 +149,19 @@ def main() -> None:
         assert killed(whole[kind], 7200.0) is None
         unbroken_s = time.monotonic() - began
         mesh = whole["meshed"] / "results" / "mesh" / "mesh.vtu"
+    longest_s = given.longest or 0.7 * unbroken_s
     random, study = np.random.default_rng(given.seed), given.work / "study"
     kills: list[dict[str, Any]] = []
     ends: list[dict[str, Any]] = []
 
     def write() -> None:
-        told = {"versions": versions(), "seed": given.seed, "unbroken_s": round(unbroken_s, 1), "kills": kills}
+        told = {
+            "versions": versions(),
+            "seed": given.seed,
+            "longest_s": longest_s,
+            "unbroken_s": round(unbroken_s, 1),
+            "kills": kills,
+        }
         given.out.write_text(json.dumps(told | {"ends": ends}, indent=1) + "\n")
 
     while len(kills) < given.kills:
@@ -162,7 +170,7 @@ def main() -> None:
         of_this = 0
         while True:
             enough = len(kills) >= given.kills
-            kill = killed(study, 7200.0 if enough else random.uniform(0.0, 0.7 * unbroken_s))
+            kill = killed(study, 7200.0 if enough else random.uniform(0.0, longest_s))
             if kill is None:
                 break
             of_this += 1
