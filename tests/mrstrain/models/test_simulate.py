@@ -133,10 +133,11 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     loads = ["--load", "a=2", "--load", "b=2,300", "--load", "c=2,400"]
     out = tmp_path / "sim"
     done = CliRunner().invoke(app, ["simulate", str(mesh_file), "--set", "luboz", *loads, *PLATE, "--out", str(out)])
-    assert done.exit_code == 1, done.output
-    assert re.search(r"luboz, b: ONLY \d+% of the load was reached", done.output)
-    assert "luboz: c was not tried" in done.output
-    assert re.search(r"b: no equilibrium was found beyond \d+% of the load, .*\(least det F 0\.\d+\)", done.output)
+    said = " ".join(done.output.split())
+    assert done.exit_code == 1, said
+    assert re.search(r"luboz, b: ONLY \d+% of the load was reached", said)
+    assert "luboz: c was not tried" in said
+    assert re.search(r"b: no equilibrium was found beyond \d+% of the load, .*\(least det F 0\.\d+\)", said)
     told = json.loads((out / "luboz" / "simulation.json").read_text())["outcome"]
     reached = told["b"]["reached"]
     assert 0.0 < reached < 1.0
@@ -159,11 +160,11 @@ def test_tissue_squeezed_beyond_its_law_is_told(mesh_file: Path, tmp_path: Path)
     told = {}
     for name in ("friedman", "luboz"):  # fat's bulk modulus 0.029 and 0.5 MPa; pressure 0.025 MPa over the whole face
         given = ["simulate", str(mesh_file), "--set", name, "--load", "a=10", *PLATE, "--out", str(tmp_path / name)]
-        told[name] = CliRunner().invoke(app, given).output
+        told[name] = " ".join(CliRunner().invoke(app, given).output.split())
     assert re.search(
         r"a: \d+\.\d% of fat is compressed below det F 0\.4, .*its bulk modulus \(0\.029 MPa\)", told["friedman"]
     )
-    assert "squeezed below" not in told["luboz"]
+    assert "compressed below" not in told["luboz"]
 
 
 def test_a_law_that_is_not_stable_at_the_strain_reached_is_told_and_ends_with_status_1(tmp_path: Path) -> None:
