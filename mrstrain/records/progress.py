@@ -143,5 +143,6 @@ def _lines_of_all() -> OnProgress:
 
 
 def _print(case: str, stage: str, fraction: float, spent_s: float) -> None:
-    left = f", {spent_s * (1 - fraction) / fraction:.0f} s left" if 0.05 < fraction < 1.0 else ""
+    known = 0.1 <= fraction < 1.0 and spent_s >= 1.0  # the first part of a stage may be known at once
+    left = f", {spent_s * (1 - fraction) / fraction:.0f} s left" if known else ""
     print(f"{case}: {stage} {100 * fraction:.0f} % after {spent_s:.0f} s{left}", file=sys.stderr, flush=True)

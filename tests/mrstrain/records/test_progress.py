@@ -46,7 +46,7 @@ def test_cases_and_stages_have_clocks_of_their_own(clock: list[float], capsys: p
     assert capsys.readouterr().err.splitlines() == [
         "Load1: aligning 0 % after 0 s",
         "Load1: registering 0 % after 0 s",
-        "Load2: aligning 50 % after 0 s, 0 s left",
+        "Load2: aligning 50 % after 0 s",
         "Load1: registering 40 % after 20 s, 30 s left",
     ]
 
