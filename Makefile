@@ -4,6 +4,7 @@
 #   make test    set-up, then lint, types, import contract and the tests
 #   make test-all  the same with the tests that need full-size images or minutes
 #   make fuzz    every reader of files on damaged copies of small valid ones, a minute each (SECONDS=10 make fuzz)
+#   make audit   known vulnerabilities of the pinned dependencies (pip-audit in .venv-audit; it needs the package index)
 #   make setup   only the environment in .venv, redone when requirements.lock or pyproject.toml changes
 #   make lint    ruff, mypy and the import contract
 #   make format  rewrite the sources as ruff formats them
@@ -36,11 +37,11 @@ THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_
 PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock docs peers clean
+.PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock audit docs peers clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,16p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,17p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -89,6 +90,16 @@ lock:
 	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-emit-index-url --no-emit-find-links --quiet $(UPGRADE) -o requirements.lock
 
+# Not part of `make test`, which works without a network. A dependency that the index does not know is a failure too
+# (--strict): it was not looked up.
+audit: .venv-audit/installed.stamp
+	.venv-audit/$(notdir $(BIN))/pip-audit --strict --disable-pip --require-hashes -r requirements.lock
+
+.venv-audit/installed.stamp:
+	"$(PYTHON)" -m venv --clear .venv-audit
+	.venv-audit/$(notdir $(BIN))/python -m pip install --disable-pip-version-check --quiet "pip-audit>=2.10"
+	@touch $@
+
 # What proselint reads: not decisions and the record of the benchmarks, which are of their time. Its checks of typography,
 # of words said twice and of spelling variants take code and formulas for prose, and are off.
 PROSE := README.md CHANGELOG.md $(wildcard docs/*.md) docs/tutorials docs/python docs/reference docs/benchmarks
@@ -110,4 +121,4 @@ peers: .venv-peers/installed.stamp
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-docs .venv-peers site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist
+	rm -rf $(VENV) .venv-docs .venv-peers .venv-audit site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist

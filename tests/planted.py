@@ -108,5 +108,5 @@ def _unpacked(content: bytes) -> list[bytes]:
             with gzip.open(io.BytesIO(content)) as stream:
                 return [stream.read()]
         return [zlib.decompressobj().decompress(content)]
-    except (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+    except (OSError, EOFError, ValueError, RuntimeError, zlib.error, zipfile.BadZipFile):
         return []

@@ -36,8 +36,11 @@ def wait_for(condition: Callable[[], bool], process: Popen | None = None, limit_
 
 
 @contextmanager
-def cluster_of_two(folder: Path) -> Iterator[tuple[str, list[Popen]]]:
-    """A Dask scheduler on loopback, by its address, and two workers of one thread each, ended with the block."""
+def cluster_of_two(folder: Path, *options: str) -> Iterator[tuple[str, list[Popen]]]:
+    """A Dask scheduler on loopback, by its address, and two workers of one thread each, ended with the block.
+
+    ``options`` are the scheduler's own.
+    """
     environment = os.environ | {"DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
     file = folder / "scheduler.json"
 
@@ -45,7 +48,7 @@ def cluster_of_two(folder: Path) -> Iterator[tuple[str, list[Popen]]]:
         asked = [sys.executable, "-m", f"distributed.cli.{command}", "--dashboard-address", "127.0.0.1:0", *given]
         return Popen([*asked, "--scheduler-file", str(file)], env=environment, stdout=DEVNULL, stderr=DEVNULL)
 
-    scheduler = started("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+    scheduler = started("dask_scheduler", "--host", "127.0.0.1", "--port", "0", *options)
     places = [("--local-directory", str(folder / str(n))) for n in range(2)]
     workers = [started("dask_worker", "--no-nanny", "--nthreads", "1", *place) for place in places]
     try:

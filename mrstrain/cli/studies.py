@@ -23,7 +23,7 @@ NoOpen = Annotated[
     ),
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://node1:8786; see docs/cluster.md.")
+    str | None, typer.Option(help="Address of a Dask scheduler, such as tls://node1:8786; see docs/cluster.md.")
 ]
 
 

@@ -10,8 +10,10 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import dask
 import psutil
@@ -215,21 +217,24 @@ class StageRunner:
 def cluster(
     watch: OnProgress, places: Sequence[Path], *, scheduler: str | None = None, workers: int | None = None
 ) -> Iterator[StageRunner]:
-    """A cluster of this machine's cores, or of the scheduler at an address (tcp://node1:8786); its stages end with it.
+    """A cluster of this machine's cores, or of the scheduler at an address (tls://node1:8786); its stages end with it.
 
     ``watch(stage, what, fraction)`` is called with the progress. Every worker must have access to ``places``, the
-    folders of results. InputError if the scheduler cannot be reached, has no workers, or has unsuitable workers.
+    folders of results. InputError if the scheduler is on a network without TLS, cannot be reached, or has no workers or
+    unsuitable ones.
     """
     logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have their own log
     with dask.config.set(_SETTINGS):
         if scheduler is None:
-            with _of_this_machine(workers or usable_cores()) as (local, client):
+            encrypted = {"distributed.comm.require-encryption": False}  # asked for with clusters in mind
+            with dask.config.set(encrypted), _of_this_machine(workers or usable_cores()) as (local, client):
                 client.run(_ignore_interrupts)
                 yield StageRunner(client, watch, local)
             return
+        _refuse_unencrypted(scheduler)
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, TypeError) as error:  # the last without certificates
             raise InputError(
                 f"No Dask scheduler answers at {scheduler} ({error}). Start one as described in docs/cluster.md."
             ) from error
@@ -268,6 +273,21 @@ def _of_this_machine(workers: int) -> Iterator[tuple[LocalCluster, Client]]:
             local.close()
         except TimeoutError:  # a worker that lacks memory may not end when it is asked to
             _kill_workers(local)
+
+
+def _refuse_unencrypted(address: str) -> None:
+    """InputError for a scheduler on a network without TLS: whoever reaches it runs code as its user."""
+    scheme, _, place = address.rpartition("://")
+    try:
+        host = urlsplit(f"//{place}").hostname or ""
+        own = host == "localhost" or ip_address(host).is_loopback
+    except ValueError:  # a name, or no address
+        own = False
+    if not own and scheme != "tls":
+        raise InputError(
+            f"{address}: whoever reaches a Dask scheduler without TLS can run code as its user. Start scheduler and "
+            "workers with TLS, as described in docs/cluster.md, and give its address as tls://HOST:PORT."
+        )
 
 
 def _ignore_interrupts() -> None:

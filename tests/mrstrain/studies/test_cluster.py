@@ -1,0 +1,81 @@
+"""A cluster's address: loopback, or TLS with the certificate that docs/cluster.md makes; nothing else."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import dask
+import pytest
+
+from dvc.errors import InputError
+from mrstrain.studies.cluster import _refuse_unencrypted, cluster
+from tests.processes import cluster_of_two
+
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://node1:8786", "node1:8786", "tcp://10.0.0.5:1", "tcp://[fe80::1]:1", "ucx://n:1", "ws://n:1",
+                "tcp://localhost.evil.org:1", "tcp://0.0.0.0:1", "tcp://127.0.0.1.nip.io:1", ""],
+)  # fmt: skip
+def test_a_scheduler_on_a_network_needs_tls(address: str) -> None:
+    with pytest.raises(InputError, match="without TLS") as told, cluster(lambda *_: None, [], scheduler=address):
+        pass
+    assert "docs/cluster.md" in str(told.value)
+    assert "tls://HOST:PORT" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:8786", "127.0.0.1:1", "tcp://[::1]:1", "tcp://localhost:1", "tls://node1:8786"]
+)
+def test_loopback_and_tls_are_let_be(address: str) -> None:
+    _refuse_unencrypted(address)
+
+
+@pytest.mark.skipif(not shutil.which("openssl"), reason="openssl is not installed")
+def test_a_cluster_with_the_certificate_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the manual says it, with another folder; whoever has no certificate is told, and whoever has another."""
+    lines = DOCS.read_text().partition("    $ mkdir -m 700 /shared/tls")[2].partition("\n\n")[0]
+    script = ("    $ mkdir -m 700 /shared/tls" + lines).replace("/shared/tls", str(tmp_path / "tls"))
+    script = "\n".join(line[4:].removeprefix("$ ") for line in script.splitlines())
+    subprocess.run(["bash", "-e", "-c", script], check=True, capture_output=True)
+    told = subprocess.run(
+        ["bash", "-c", f"source '{tmp_path}/tls/settings.sh'; env"], check=True, capture_output=True, text=True
+    ).stdout
+    settings = dict(line.split("=", 1) for line in told.splitlines() if line.startswith("DASK_DISTRIBUTED__COMM"))
+    assert len(settings) == 8
+    assert os.stat(tmp_path / "tls").st_mode & 0o077 == 0
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    keys = {name.removeprefix("DASK_").lower().replace("__", "."): value for name, value in settings.items()}
+    with cluster_of_two(tmp_path, "--protocol", "tls") as (address, _):
+        assert address.startswith("tls://127.0.0.1:")
+        with (
+            dask.config.set(keys),
+            cluster(lambda *_: None, [tmp_path], scheduler=address),
+        ):
+            pass  # workers were found, and are fit
+        with (
+            pytest.raises(InputError, match="No Dask scheduler answers"),
+            cluster(lambda *_: None, [tmp_path], scheduler=address),
+        ):
+            pass
+        with (
+            pytest.raises(InputError, match="No Dask scheduler answers"),
+            cluster(lambda *_: None, [tmp_path], scheduler=address.replace("tls", "tcp")),
+        ):
+            pass
+
+
+def test_settings_for_a_cluster_with_tls_leave_this_machines_own_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION", "True")
+    with (
+        dask.config.set({"distributed.comm.require-encryption": True}),
+        cluster(lambda *_: None, [tmp_path], workers=1),
+    ):
+        pass
