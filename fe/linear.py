@@ -5,11 +5,14 @@ SuperLU. Factorisations take most of the time of a simulation. PARDISO therefore
 factorisation is reused as long as that is faster; it then preconditions an iterative solution in double precision.
 """
 
+import os
 import platform
 from contextlib import suppress
-from ctypes import POINTER, byref, c_int32, c_int64, c_void_p
-from functools import partial
+from ctypes import CDLL, POINTER, byref, c_int32, c_int64, c_void_p
+from functools import cache, partial
+from importlib.metadata import PackageNotFoundError, files
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,10 +35,25 @@ class SingularError(MrstrainError, RuntimeError):
     """A matrix that cannot be factorised: a part of the model is free to move, or memory is short."""
 
 
+@cache
+def tell_where_mkl_is() -> None:
+    """Set the variable that pypardiso reads; without it, each solver starts compilers and searches the environment.
+
+    A value that the user has set stays; where the distribution does not list a library that loads, pypardiso searches.
+    """
+    with suppress(PackageNotFoundError):
+        for file in files("mkl") or ():
+            if "mkl_rt" in file.name:
+                with suppress(OSError):
+                    CDLL(path := str(Path(file.locate()).resolve()))
+                    os.environ.setdefault("PYPARDISO_MKL_RT", path)
+
+
 class _Pardiso:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
         from pypardiso import PyPardisoSolver
 
+        tell_where_mkl_is()
         self.rough, self.size = rough, len(indptr) - 1
         self._kind = np.float32 if rough else np.float64
         self._pattern = [np.asarray(of + 1, dtype=np.int32) for of in (indptr, indices)]  # counted from 1

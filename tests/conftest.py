@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,24 @@ settings.load_profile("fixed")
 def one_thread() -> None:
     """Two workers have a core each: tests of threads ask for theirs."""
     threads.use(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _coarse_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """In `make test` alone; `make test-all` draws all figures as users get them."""
+    from tests.pictures import coarse_pictures
+
+    with coarse_pictures() if "not full_size" in request.config.option.markexpr else nullcontext():
+        yield
+
+
+@pytest.fixture
+def real_pictures() -> Iterator[None]:
+    """For tests that look at figures."""
+    from tests.pictures import real_pictures
+
+    with real_pictures():
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -93,6 +112,18 @@ def heel_pair_once(computed_once) -> Callable[..., Any]:
 
 
 @pytest.fixture(scope="session")
+def mesh_labels_once(computed_once) -> Callable[..., Any]:
+    """`fe.mesh_labels`, which makes each mesh once for all tests."""
+    from fe import mesh_labels
+
+    def mesh(*given: Any, **more: Any) -> Any:
+        asked = hashlib.sha256(pickle.dumps((given, more))).hexdigest()
+        return computed_once(f"mesh {asked}", lambda: mesh_labels(*given, **more))
+
+    return mesh
+
+
+@pytest.fixture(scope="session")
 def small_pair(heel_pair_once):
     """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
     return heel_pair_once(3, load=0.6, shape=(64, 72, 68), spacing_mm=1.6)
@@ -105,18 +136,12 @@ def tiny_pair(heel_pair_once):
 
 
 @pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tasks of workers run here, one at a time: a process of their own costs three seconds of imports for each."""
-    from dvc.worker import Worker
+def in_this_process() -> Iterator[None]:
+    """As `tasks_run_here`, for a test."""
+    from tests.processes import tasks_run_here
 
-    here = Lock()
-
-    def run(_: Worker, what: str, task: Callable[..., Any], *given: Any, **_watch: Any) -> Any:
-        with here:
-            return task(*given)
-
-    monkeypatch.setattr(Worker, "run", run)
-    monkeypatch.setattr(Worker, "start", lambda *_: None)
+    with tasks_run_here():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Processes beside the test's own: waiting for what they do, and a cluster of them."""
+"""Processes beside the test's own: doing without them, waiting for what they do, and a cluster of them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import DEVNULL, Popen
+from threading import Lock
+from typing import Any
 
+import pytest
 from filelock import FileLock, Timeout
+
+from dvc.worker import Worker
 
 
 def under_way(records: Path, stage: str) -> bool:
@@ -33,6 +38,35 @@ def wait_for(condition: Callable[[], bool], process: Popen | None = None, limit_
         assert process is None or process.poll() is None, "it ended before"
         assert time.monotonic() - began < limit_s, "it took too long"
         time.sleep(0.2 if process else 0.02)
+
+
+@contextmanager
+def tasks_run_here() -> Iterator[None]:
+    """Tasks of workers run in this process, one at a time: one of their own costs two seconds of imports for each."""
+    here = Lock()
+
+    def run(_: Worker, what: str, task: Callable[..., Any], *given: Any, **_watch: Any) -> Any:
+        with here:
+            return task(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Worker, "run", run)
+        patch.setattr(Worker, "start", lambda *_: None)
+        yield
+
+
+@contextmanager
+def tasks_run_in(one: Worker) -> Iterator[None]:
+    """Tasks of all workers run in the process of one: the first use of elastix takes ten seconds in each."""
+    run = Worker.run
+
+    def there(_: Worker, *given: Any, **watch: Any) -> Any:
+        return run(one, *given, **watch)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Worker, "run", there)
+        patch.setattr(Worker, "start", lambda *_: None)
+        yield
 
 
 @contextmanager

@@ -45,6 +45,7 @@ def test_a_comparison_and_its_loads(copied: Callable[[Any], Any]) -> None:
     assert again.loads[0].case.read()[1][0].name == "a"
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_measurement_with_its_images(tiny_pair: Any, worker: Any) -> None:
     settings = dvc.Settings(dvc.GaussNewton(bending=4.0, volume=300.0))
     made = dvc.measure(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.bone, settings=settings, worker=worker)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from matplotlib import pyplot as plt
 
+import fe
 import phantoms
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -21,8 +22,9 @@ MOST_BYTES = 40_000
     [pytest.param(one, id=one.stem, marks=[pytest.mark.full_size] * (one.stem in SLOW)) for one in EXAMPLES],
 )
 @pytest.mark.usefixtures("in_this_process")
-def test_an_example_draws_its_picture(example, tmp_path, monkeypatch, heel_pair_once) -> None:
+def test_an_example_draws_its_picture(example, tmp_path, monkeypatch, heel_pair_once, mesh_labels_once) -> None:
     monkeypatch.setattr(phantoms, "heel_pair", heel_pair_once)
+    monkeypatch.setattr(fe, "mesh_labels", mesh_labels_once)
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("agg")
     try:

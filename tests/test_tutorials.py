@@ -5,6 +5,7 @@ from __future__ import annotations
 import pkgutil
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import typer
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
+import fe
 from dvc import Grid, Image, StrainField
 from dvc.io.images.labels import read_labels
 from dvc.io.images.write import write_image, write_mask
@@ -91,6 +93,7 @@ def heel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return quick_phantom(tmp_path_factory.mktemp("made") / "heel", seed=1)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_lines_of_the_readme(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -102,20 +105,27 @@ def test_the_lines_of_the_readme(
     assert (tmp_path / "max_shear.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_dvc_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy_scans(tmp_path)
     follow("python/dvc.md", tmp_path, monkeypatch)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_fe_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("python/fe.md", tmp_path, monkeypatch)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_phantoms_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("python/phantoms.md", tmp_path, monkeypatch)
 
 
-def test_validate_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("in_this_process")
+def test_validate_in_python(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mesh_labels_once: Callable[..., object]
+) -> None:
+    monkeypatch.setattr(fe, "mesh_labels", mesh_labels_once)  # the gallery has the same
     follow("python/validate.md", tmp_path, monkeypatch)  # which makes all its files itself
 
 
@@ -166,6 +176,7 @@ def test_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("tutorials/preset.md", tmp_path, monkeypatch)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("tutorials/material.md", tmp_path, monkeypatch)
 

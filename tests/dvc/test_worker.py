@@ -12,7 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
-from dvc import register
+import dvc  # whose functions load when they are asked for: the processes of these tests import this file
 from dvc.errors import RegistrationError, WorkerError
 from dvc.worker import Worker, each_in_workers, side_by_side
 
@@ -162,7 +162,9 @@ def test_an_interrupted_registration_leaves_no_process_and_the_next_begins(tiny_
     before = workers()
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
-            register(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.labels.region("bone"), progress=interrupt)
+            dvc.register(
+                tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.labels.region("bone"), progress=interrupt
+            )
         assert workers() <= before
 
 

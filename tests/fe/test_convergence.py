@@ -59,6 +59,7 @@ def test_no_limit_is_told_where_there_is_none() -> None:
             extrapolate(sizes, sizes)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With blocks in the place of the mesher's tetrahedra."""
     counts, made = {6.0: (3, 4, 4), 4.0: (4, 6, 6), 2.5: (5, 8, 8)}, []

@@ -50,11 +50,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     exact = curve_of(law, stretch, mode)
     truth = [p.value for p in fit([exact], name).parameters]
     size = noise * np.abs(exact.stress_mpa).max()
-    tries, held = 400, np.zeros(len(truth))
+    tries, held = 200, np.zeros(len(truth))
     for _ in range(tries):
         noisy = Curve(mode, stretch, exact.stress_mpa + random.normal(0.0, size, len(stretch)))
         held += [p.low <= t <= p.high for p, t in zip(fit([noisy], name).parameters, truth, strict=True)]
-    # 95 % of 400: a standard deviation is 1.1 %
+    # 95 % of 200: a standard deviation is 1.5 %; intervals that hold 88 % are noticed in 19 of 20 tests
     assert (held / tries > 0.95 - 0.033).all(), held / tries
     assert (held / tries < 0.95 + 0.033).all(), held / tries
 

@@ -209,6 +209,7 @@ def test_a_mesh_comes_back_with_every_name(tmp_path: Path) -> None:
         read_tet_mesh(tmp_path / "box.vtu")
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_the_command_writes_mesh_names_and_picture(tmp_path: Path) -> None:
     from typer.testing import CliRunner
 

@@ -110,6 +110,7 @@ def test_a_path_cut_while_the_plate_approaches_ends_where_an_uncut_one_does(
     assert np.abs(on.u_mm - whole.u_mm).max() < 0.01 * np.abs(whole.u_mm).max()
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_command_tells_that_time_was_over(tmp_path: Path) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
     given = [*GIVEN, "--out", str(tmp_path / "out"), "--limit-minutes", "0.00001"]
@@ -119,6 +120,7 @@ def test_the_command_tells_that_time_was_over(tmp_path: Path) -> None:
     assert "b was not tried" in ended.output
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize(("limit_s", "complete"), [(1e-6, False), (None, True)])
 def test_a_stage_tells_that_nothing_but_time_was_lacking(tmp_path: Path, limit_s: float | None, complete: bool) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
@@ -166,6 +168,7 @@ def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) ->
         assert read_checkpoint(place, made_from()) is None
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((4, 6, 6)), {})
     command = ["simulate", str(tmp_path / "dome.vtu"), *GIVEN]

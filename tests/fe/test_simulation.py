@@ -116,6 +116,7 @@ def test_what_was_not_reached_comes_back_and_is_marked_everywhere(unreached: fe.
     assert "far & too" not in shown
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_a_notebook_shows_a_picture_and_a_table(simulation: fe.Simulation) -> None:
     shown = simulation._repr_html_()
     assert "mine: 3 of 3 loads reached" in shown

@@ -19,6 +19,7 @@ from tests.golden.scenes import SCENES
     "scene",
     [pytest.param(name, marks=pytest.mark.full_size) if name in ("study", "elastix") else name for name in SCENES],
 )
+@pytest.mark.usefixtures("in_this_process")
 def test_the_record_holds(scene: str, tmp_path: Path) -> None:
     wrong, words = check(scene, quantities(SCENES[scene](tmp_path, 1)))
     print(words)

@@ -15,6 +15,8 @@ from tests.validate.test_comparison import case, cube, labels, max_shear, result
 from validate import compare_load
 from validate.strain_by_load import MEASURED, Strip, strain_by_load
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 GAMMAS = {"half": 0.2, "double": 0.8}
 POINT = np.array([5.0, 10.0, 12.0])
 

@@ -22,6 +22,9 @@ from dvc.registration.register import Settings
 from dvc.report.page import Picture
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
 from dvc.trust.twin_judgement import Judged
+from tests.processes import tasks_run_here
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 GRID = dvc.Grid((14, 16, 18), (1.5, 1.2, 1.0), (-8.0, 3.0, 5.0))
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -35,18 +38,19 @@ def measured(tiny_pair, worker) -> dvc.Measurement:
     flat = np.full((2, 1, 2), 0.02)
     table = ErrorTable(np.full(3, 2.3), 25.0, np.array([0.0, 0.5]), np.zeros(1), {POOLED: flat}, ({POOLED: flat},), 4.0)
     digest = hashlib.sha256(settings.engine.text.encode()).hexdigest()
-    return dvc.measure(
-        tiny_pair.reference,
-        tiny_pair.loaded,
-        bone=tiny_pair.bone,
-        labels=tiny_pair.labels,
-        settings=settings,
-        error_model=ErrorModel("gauss-newton", digest, (table,), "made up"),
-        repeat=tiny_pair.repeat,
-        shear_direction=(0.0, -1.0, 0.0),
-        name="Load1",
-        worker=worker,
-    )
+    with tasks_run_here():
+        return dvc.measure(
+            tiny_pair.reference,
+            tiny_pair.loaded,
+            bone=tiny_pair.bone,
+            labels=tiny_pair.labels,
+            settings=settings,
+            error_model=ErrorModel("gauss-newton", digest, (table,), "made up"),
+            repeat=tiny_pair.repeat,
+            shear_direction=(0.0, -1.0, 0.0),
+            name="Load1",
+            worker=worker,
+        )
 
 
 @pytest.fixture(scope="module")

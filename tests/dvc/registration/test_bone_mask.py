@@ -44,6 +44,7 @@ def test_noise_and_a_mask_at_the_ends_of_the_image_raise_no_doubt(tiny_pair):
         assert mirrored_doubt(noise, Mask(grid, inside)) == ""
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_doubt_is_warned_of_and_lowers_the_verdict(tiny_pair, caplog):
     bone, weights = flipped(tiny_pair.bone, 0, 1), GaussNewton(bending=3.0, volume=300.0)
     with caplog.at_level(logging.WARNING):

@@ -24,6 +24,8 @@ from dvc.report.drawing import Drawing, save_figure
 from dvc.report.sheet import View
 from dvc.report.style import TISSUES, Look, looks
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 
 def curve() -> Figure:
     """A curve."""

@@ -19,6 +19,8 @@ from dvc.report import figures
 from dvc.report.drawing import png_bytes
 from dvc.report.sheet import LETTERS, PLANES, UNSEEN, Plane, Sheet, View
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 # Where a point that lies 12 mm off the centre in one direction must appear: (across, down), -1, 0 or 1.
 SIDES: dict[str, dict[Plane, tuple[int, int]]] = {
     "L": {"coronal": (1, 0), "axial": (1, 0)},

@@ -22,6 +22,8 @@ from dvc.report.figures import shear_curves
 from dvc.report.page import Picture, Section, Table, Viewer, Volume, shown, write_report
 from dvc.trust.verdict import Verdict
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 ATTACK = "<script>alert('x')</script><img src=x onerror=y>\"&"
 TRUST, FOLDS = Verdict("trust"), Verdict("distrust", (f"It folds {ATTACK}.",))
 

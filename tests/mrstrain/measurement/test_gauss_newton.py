@@ -25,6 +25,9 @@ from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.register import register as run, register_one
 from mrstrain.options.measurement import RegistrationOptions
 from phantoms import Heel, scan
+from tests.processes import tasks_run_here
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +36,11 @@ def written(made_once, small_pair) -> Path:
         write_image(folder / "Load0.nii.gz", small_pair.reference)
         write_image(folder / "Load1.nii.gz", small_pair.loaded)
         write_mask(folder / "bone.nii.gz", small_pair.bone)
-        results = run(
-            folder / "Load0.nii.gz", [folder / "Load1.nii.gz"], out=folder / "out", bone=folder / "bone.nii.gz",
-            threads=1,
-        )  # fmt: skip
+        with tasks_run_here():
+            results = run(
+                folder / "Load0.nii.gz", [folder / "Load1.nii.gz"], out=folder / "out", bone=folder / "bone.nii.gz",
+                threads=1,
+            )  # fmt: skip
         assert not results.failures
 
     return made_once("by-gauss-newton", fill)

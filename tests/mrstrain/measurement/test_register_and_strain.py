@@ -35,6 +35,8 @@ from mrstrain.measurement.strain import strain
 from mrstrain.options.measurement import EngineOptions, SubjectFiles
 from mrstrain.options.modelling import ComparisonLabels
 from mrstrain.records.measured_with import MeasuredWith
+from tests.pictures import real_pictures
+from tests.processes import tasks_run_in
 from tests.quick import QUICK
 
 PATIENT = "Doe^Jane"
@@ -70,14 +72,15 @@ def _fill(folder: Path, tiny_pair) -> None:
 
 
 @pytest.fixture(scope="module")
-def results(study, computed_once):
+def results(study, worker, computed_once):
     given = {
         "out": study / "out", "bone": study / "bone.nii.gz", "labels": study / "tissues.nrrd",
         "names": study / "tissues.csv", "parameters": [study / "quick.txt"], "repeat": study / "again.nii.gz",
         "landmarks": study / "points.csv", "mesh": study / "mesh.vtu", "error_model": study / "errors.json",
         "shear_direction": (0.0, -1.0, 0.0), "workers": 1, "threads": 1, "seed": 5,
     }  # fmt: skip
-    return computed_once("results", lambda: register(study / "Load0.nii.gz", [study / "Load1.nii.gz"], **given))
+    with tasks_run_in(worker), real_pictures():
+        return computed_once("results", lambda: register(study / "Load0.nii.gz", [study / "Load1.nii.gz"], **given))
 
 
 PROMISED = [
@@ -290,6 +293,7 @@ def test_strain_from_a_displacement_image_too(results, study):
     assert np.median(np.abs(a[both] - b[both])) < 2e-3
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_failing_load_is_named_and_the_others_finish(study, tiny_pair):
     random = np.random.default_rng(3)
     write_image(

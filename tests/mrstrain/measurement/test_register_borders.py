@@ -36,6 +36,7 @@ from mrstrain.measurement.strain import read_any, strain
 from mrstrain.options.measurement import RegistrationOptions
 from phantoms import Heel, distances_mm, labels_of, random_foot_motion, scan, sliding
 from tests.dvc.deformation.test_interface_spline import scanned, sheared
+from tests.processes import tasks_run_here
 
 GRID = Grid((35, 35, 28), (1.6, 1.6, 1.6), (-28.2, -10.2, -43.6))  # the pad, with the lower half of the calcaneus
 INNER = (slice(3, -3),) * 3
@@ -83,9 +84,10 @@ def asked(pad: Pad, **more: object) -> dict[str, object]:
 @pytest.fixture(scope="module")
 def out(pad) -> Path:
     """The load registered with a label map, and so with borders."""
-    results = run(
-        pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=pad.folder / "out", threads=1, **asked(pad)
-    )
+    with tasks_run_here():
+        results = run(
+            pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=pad.folder / "out", threads=1, **asked(pad)
+        )
     assert not results.failures
     return results.out
 

@@ -81,7 +81,7 @@ class Spy:
 
 
 @pytest.fixture
-def spy(monkeypatch, scans, tiny_pair) -> Spy:
+def spy(monkeypatch, scans, tiny_pair, in_this_process) -> Spy:
     control = control_grid(tiny_pair.reference.grid, np.full(3, 8.0))
     one = Spy(scans, BSpline(control, spline_through(tiny_pair.deformation, control)), [], [], {})
     monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", one.register)

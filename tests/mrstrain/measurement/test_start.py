@@ -16,6 +16,8 @@ from dvc.registration.align import motion_of
 from mrstrain.measurement.register import register
 from tests.textures import GRID, TURNED, everything, pair_of
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 FAR = np.array([14.0, -10.0, 9.0])
 SHIFT = np.array([1.3, -0.6, 0.7])
 

@@ -22,6 +22,8 @@ from dvc.registration.engine import AlignedPair, Engine, Found
 from dvc.registration.engines import ENGINES, methods_of
 from dvc.registration.register import Settings, register
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 GRID = Grid((24, 22, 20), (1.5, 1.5, 1.5), (-18.0, -16.0, -15.0))
 SHIFT = np.array([1.5, -3.0, 0.0])
 

@@ -12,6 +12,8 @@ from fe import material_set
 from mrstrain.cli.app import app
 from mrstrain.models.fit import fit
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 
 def write_curve(path: Path) -> Path:
     stretch = np.linspace(0.5, 1.0, 25)

@@ -57,6 +57,7 @@ def mesh_file(tmp_path: Path) -> Path:
     return tmp_path / "dome.vtu"
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> None:
     own = tmp_path / "mine.toml"
     own.write_text(MINE)

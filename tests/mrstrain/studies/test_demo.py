@@ -126,7 +126,7 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     (load2,) = (load for load in LOADS if load.name == "Load2")
     monkeypatch.setattr(demonstration, "LOADS", [load2])
     monkeypatch.setattr(demonstration, "phantom", partial(phantom, spacing_mm=2.3, loads=["Load2"]))
-    monkeypatch.setattr(demonstration, "run_studies", partial(run_studies, only=["register Load2"]))
+    monkeypatch.setattr(demonstration, "run_studies", partial(run_studies, only=["register Load2"], workers=1))
     demonstration._make(tmp_path / "demo", 3, False, None)
     quick = "[registration]\nborders = false\nbending = 3.0\nvolume = 300.0\n"
     study = tmp_path / "demo" / "study.toml"

@@ -26,6 +26,7 @@ from mrstrain.studies.init import NewStudy, StudyInputs, init
 from mrstrain.studies.picture import Labelled
 
 LABELLED = StudyInputs(load0="Load0.nii.gz", loads={"Load1": "Load1.nii.gz"}, labels="tissues.nii.gz")
+pytestmark = pytest.mark.usefixtures("real_pictures")
 
 
 def folder_of(place: Path, *names: str) -> Path:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -27,8 +28,13 @@ from tests.processes import under_way, wait_for
 SAID_S, OVER_S = 2.0, 10.0
 
 
-def interrupted(command: list[str], err: Path, begun: Callable[[psutil.Process], bool], *, group: bool) -> None:
-    """Start a command, interrupt it or its group once it has begun, and see that it ends as it should."""
+slow = partial(pytest.param, marks=pytest.mark.full_size)  # each command has one of process and group in `make test`
+
+
+def interrupted(
+    command: list[str], err: Path, begun: Callable[[psutil.Process], bool], *, group: bool, by: int = signal.SIGINT
+) -> int:
+    """Start a command, interrupt it or its group once it has begun, and see that it ends as it should; its status."""
     with err.open("wb") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "mrstrain", *command], stdout=subprocess.DEVNULL, stderr=errors,
@@ -37,9 +43,9 @@ def interrupted(command: list[str], err: Path, begun: Callable[[psutil.Process],
     try:
         wait_for(lambda: begun(psutil.Process(process.pid)), process)
         below = psutil.Process(process.pid).children(recursive=True)
-        (os.killpg if group else os.kill)(process.pid, signal.SIGINT)
+        (os.killpg if group else os.kill)(process.pid, by)
         began = time.monotonic()
-        while b"Stopping." not in err.read_bytes():
+        while by == signal.SIGINT and b"Stopping." not in err.read_bytes():
             assert time.monotonic() - began < SAID_S, "it did not say so"
             time.sleep(0.05)
         status = process.wait(timeout=OVER_S)
@@ -48,13 +54,14 @@ def interrupted(command: list[str], err: Path, begun: Callable[[psutil.Process],
         assert not [one for one in left if one.status() != psutil.STATUS_ZOMBIE]
         told = err.read_text()
         assert "Traceback" not in told, told
+        return status
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 
 
-@pytest.mark.parametrize("group", [False, True], ids=["process", "group"])
+@pytest.mark.parametrize("group", [slow(False, id="process"), pytest.param(True, id="group")])
 def test_a_study_ends_and_goes_on(images, tmp_path, group):
     study = tmp_path / "study"
     shutil.copytree(images, study)
@@ -89,12 +96,19 @@ def test_a_study_whose_processes_hang_ends_and_leaves_nothing_in_shared_memory(i
     assert shared == []
 
 
-@pytest.mark.parametrize("group", [False, True], ids=["process", "group"])
-def test_a_registration_ends(images, tmp_path, group):
+@pytest.mark.parametrize(
+    ("by", "group"),
+    [
+        pytest.param(signal.SIGINT, False, id="process"), slow(signal.SIGINT, True, id="group"),
+        pytest.param(signal.SIGTERM, False, id="told to end"),
+    ],
+)  # fmt: skip
+def test_a_registration_ends(images, tmp_path, by, group):
     given = [str(images / name) for name in ("Load0.nii.gz", "Load1.nii.gz")]
     out, err = tmp_path / "out", tmp_path / "err.txt"
     command = ["register", *given, "--align", "image", "--out", str(out)]
-    interrupted(command, err, lambda _: err.exists() and b"aligning" in err.read_bytes(), group=group)
+    status = interrupted(command, err, lambda _: err.exists() and b"aligning" in err.read_bytes(), group=group, by=by)
+    assert by == signal.SIGINT or status == 128 + by
     assert not out.exists() or list(out.iterdir()) == []
 
 
@@ -149,8 +163,8 @@ def running_a_cohort(images: Path, folder: Path) -> Case:
 @pytest.mark.parametrize(
     ("case", "group"),
     [
-        (simulating, False), (simulating, True), (meshing, False), (meshing, True), (measuring_accuracy, False),
-        (running_a_cohort, True),
+        (simulating, False), slow(simulating, True), slow(meshing, False), (meshing, True),
+        (measuring_accuracy, False), (running_a_cohort, True),
     ],
 )  # fmt: skip
 def test_a_command_ends_and_keeps_what_is_finished(case, group, images, tmp_path):

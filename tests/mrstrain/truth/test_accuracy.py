@@ -66,6 +66,7 @@ def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
     assert expected_minutes([CASE] * 10, 1) == pytest.approx(2.0 * elastix)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two runs, of which one is measured and one made up; then a third alone is made, and the page tells of all."""
 
@@ -165,6 +166,7 @@ def test_a_folding_motion_is_found_before_any_image_is_made(monkeypatch: pytest.
         accuracy(tmp_path / "out", cases=[CASE])
 
 
+@pytest.mark.full_size  # `make test` ends a registration so: test_interrupt
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are needed to see that none is left")
 def test_a_study_that_is_told_to_end_leaves_no_process_behind(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mrstrain", "accuracy", "--out", str(tmp_path), "--spacing", "2.3"]
@@ -196,6 +198,7 @@ def _alive(group: int) -> bool:
     return True
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def measured(case: AccuracyCase, *_: object) -> ErrorSamples:
         if case.motion == "Load2":
@@ -209,6 +212,7 @@ def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPat
     assert "the optimiser diverged" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_two_parameter_files_of_one_name_are_never_taken_for_each_other(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

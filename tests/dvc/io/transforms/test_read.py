@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +18,7 @@ from dvc.images.image import Grid
 from dvc.io.transforms.elastix_text import format_parameters, parse_parameters
 from dvc.io.transforms.read import Added, bspline_from_elastix, read_transform, rigid_from_elastix
 from dvc.io.transforms.write import write_elastix_transform, write_itk_transform
+from dvc.worker import Worker
 
 OBLIQUE = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 PERMUTED = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -28,41 +26,40 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
 MOTION = RigidMotion(Rotation.from_euler("xyz", [9, -14, 21], degrees=True).as_matrix(), np.array([3.0, -5.0, 2.0]))
 SHAPE = (10, 11, 12)
 
-# One process for all of it: the first use of elastix takes 12 s or more, and native code may crash.
-TRANSFORMIX = """
-import sys, json
-from pathlib import Path
-import itk, numpy as np, SimpleITK as sitk
-folder = Path(sys.argv[1])
-image = itk.image_from_array(np.zeros((5, 5, 5), np.float32))
-def run(case, points):
-    out = folder / case["name"] / "out"
-    out.mkdir(exist_ok=True)
-    method = itk.TransformixFilter[itk.Image[itk.F, 3]].New()
-    method.SetMovingImage(image)
-    method.SetTransformParameterFileName(case["file"])
-    if points:
-        method.SetFixedPointSetFileName(str(folder / case["name"] / "points.txt"))
-    else:
-        method.SetComputeDeformationField(True)
-        method.SetComputeSpatialJacobian(True)
-    method.SetOutputDirectory(str(out))
-    method.SetLogToConsole(False)
-    method.UpdateLargestPossibleRegion()
-    return method, out
-found = {}
-for case in json.loads((folder / "cases.json").read_text()):
-    method, out = run(case, False)
-    found[case["name"] + ".u"] = itk.array_from_image(method.GetOutputDeformationField())
-    (jacobian,) = out.glob("fullSpatialJacobian*")
-    found[case["name"] + ".F"] = sitk.GetArrayFromImage(sitk.ReadImage(str(jacobian)))
-    _, out = run(case, True)
-    rows = (out / "outputpoints.txt").read_text().splitlines()
-    found[case["name"] + ".x"] = np.array(
-        [[float(v) for v in row.split("OutputPoint = [")[1].split("]")[0].split()] for row in rows]
-    )
-np.savez(folder / "found.npz", **found)
-"""
+
+def transformed(files: dict[str, Path]) -> dict[str, np.ndarray]:
+    """What transformix says of every case, for a worker: native code may crash."""
+    import itk
+
+    image = itk.image_from_array(np.zeros((5, 5, 5), np.float32))
+
+    def run(file: Path, *, points: bool) -> tuple[Any, Path]:
+        out = file.parent / "out"
+        out.mkdir(exist_ok=True)
+        method = itk.TransformixFilter[itk.Image[itk.F, 3]].New()
+        method.SetMovingImage(image)
+        method.SetTransformParameterFileName(str(file))
+        if points:
+            method.SetFixedPointSetFileName(str(file.parent / "points.txt"))
+        else:
+            method.SetComputeDeformationField(True)
+            method.SetComputeSpatialJacobian(True)
+        method.SetOutputDirectory(str(out))
+        method.SetLogToConsole(False)
+        method.UpdateLargestPossibleRegion()
+        return method, out
+
+    found = {}
+    for name, file in files.items():
+        method, out = run(file, points=False)
+        found[name + ".u"] = itk.array_from_image(method.GetOutputDeformationField())
+        (jacobian,) = out.glob("fullSpatialJacobian*")
+        found[name + ".F"] = sitk.GetArrayFromImage(sitk.ReadImage(str(jacobian)))
+        _, out = run(file, points=True)
+        rows = (out / "outputpoints.txt").read_text().splitlines()
+        told = [row.split("OutputPoint = [")[1].split("]")[0].split() for row in rows]
+        found[name + ".x"] = np.array(told, dtype=float)
+    return found
 
 
 def spline(direction: np.ndarray, seed: int = 1, size_mm: float = 0.6) -> BSpline:
@@ -213,22 +210,13 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Gri
 
 
 @pytest.fixture(scope="session")
-def transformix(cases: dict[str, tuple[Path, Grid]]) -> dict[str, np.ndarray]:
+def transformix(cases: dict[str, tuple[Path, Grid]], worker: Worker, computed_once) -> dict[str, np.ndarray]:
     """What transformix says of every case: displacement, F and points."""
-    folder = next(iter(cases.values()))[0].parents[1]
-    for name, (_, grid) in cases.items():
+    for file, grid in cases.values():
         rows = [" ".join(repr(float(v)) for v in p) for p in off_grid_points(grid)]
-        (folder / name / "points.txt").write_text("\n".join(["point", str(len(rows)), *rows]) + "\n")
-    listed = [{"name": name, "file": str(file)} for name, (file, _) in cases.items()]
-    (folder / "cases.json").write_text(json.dumps(listed))
-    environment = {**os.environ, "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", TRANSFORMIX, str(folder)],
-        capture_output=True, text=True, env=environment, cwd=folder, timeout=600, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    with np.load(folder / "found.npz") as found:
-        return {name: found[name] for name in found.files}
+        (file.parent / "points.txt").write_text("\n".join(["point", str(len(rows)), *rows]) + "\n")
+    files = {name: file for name, (file, _) in cases.items()}
+    return computed_once("transformix", lambda: worker.run("transformix", transformed, files))
 
 
 def off_grid_points(grid: Grid) -> np.ndarray:
