@@ -5,6 +5,7 @@
 #   make test-all  the same with the tests that need full-size images or minutes
 #   make fuzz    every reader of files on damaged copies of small valid ones, a minute each (SECONDS=10 make fuzz)
 #   make audit   known vulnerabilities of the pinned dependencies (pip-audit in .venv-audit; it needs the package index)
+#   make clean-install  the wheel in an environment of its own that nobody can write to, without a display (needs the index)
 #   make setup   only the environment in .venv, redone when requirements.lock or pyproject.toml changes
 #   make lint    ruff, mypy and the import contract
 #   make format  rewrite the sources as ruff formats them
@@ -37,11 +38,11 @@ THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_
 PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock audit docs peers clean
+.PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock audit clean-install docs peers clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,17p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,18p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -99,6 +100,9 @@ audit: .venv-audit/installed.stamp
 	"$(PYTHON)" -m venv --clear .venv-audit
 	.venv-audit/$(notdir $(BIN))/python -m pip install --disable-pip-version-check --quiet "pip-audit>=2.10"
 	@touch $@
+
+clean-install: setup
+	$(BIN)/python -m tests.clean_install
 
 # What proselint reads: not decisions and the record of the benchmarks, which are of their time. Its checks of typography,
 # of words said twice and of spelling variants take code and formulas for prose, and are off.
