@@ -119,12 +119,10 @@ class StageRunner:
     def next(self) -> tuple[str, StageResult | str, float]:
         """Wait for the next stage to end; its name, its result or the reason of its failure, and its time, s.
 
-        A stage that a process of died is tried once more, on one core, when no other is under way and in workers that
-        were started anew: its memory may have run out. One that hangs is ended.
+        A stage that a process of died is tried once more, on one core, when no other is under way: its memory may have
+        run out. One that hangs is ended.
         """
         if not self._under_way and self._died:
-            if self._local is not None:  # workers keep what libraries and earlier stages took
-                self._client.restart_workers([*self._client.nthreads()], raise_for_error=False)
             self._submit(self._died.pop(0))
         lost_since: float | None = None
         while True:

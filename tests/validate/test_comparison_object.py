@@ -16,6 +16,7 @@ from dvc.report.page import shown
 from dvc.trust.error_model import ErrorTable
 from dvc.trust.verdict import Verdict
 from dvc.worker import side_by_side
+from tests.pictures import real_pictures
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
 from validate.report import area_rows, load_sections
@@ -38,7 +39,8 @@ def comparison() -> Comparison:
 @pytest.fixture(scope="module")
 def folder(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("compared")
-    comparison.write(place, on_image=True)
+    with real_pictures():  # as in processes of their own
+        comparison.write(place, on_image=True)
     return place
 
 
