@@ -39,11 +39,12 @@ def comparison() -> Comparison:
 @pytest.fixture(scope="module")
 def folder(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("compared")
-    with real_pictures():  # as in processes of their own
+    with real_pictures():
         comparison.write(place, on_image=True)
     return place
 
 
+@pytest.mark.usefixtures("real_pictures")  # as in processes of their own
 def test_loads_compared_in_processes_give_the_same_to_the_bit(comparison: Comparison, folder: Path, tmp_path) -> None:
     with side_by_side("comparing", 2) as each:
         cases, by = [one.case for one in comparison.loads], comparison.loads[0].criteria

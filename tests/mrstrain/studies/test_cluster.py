@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import dask
 import pytest
@@ -70,12 +73,15 @@ def test_a_cluster_with_the_certificate_of_the_manual(tmp_path: Path, monkeypatc
             pass
 
 
-def test_settings_for_a_cluster_with_tls_leave_this_machines_own_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION", "True")
-    with (
-        dask.config.set({"distributed.comm.require-encryption": True}),
-        cluster(lambda *_: None, [tmp_path], workers=1),
-    ):
+def test_settings_for_a_cluster_with_tls_leave_this_machines_own_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[object]()
+
+    @contextmanager
+    def seen(_: int) -> Iterator[tuple[None, SimpleNamespace]]:
+        asked.append(dask.config.get("distributed.comm.require-encryption"))
+        yield None, SimpleNamespace(run=lambda _: None, subscribe_topic=lambda *_: None)
+
+    monkeypatch.setattr("mrstrain.studies.cluster._of_this_machine", seen)
+    with dask.config.set({"distributed.comm.require-encryption": True}), cluster(lambda *_: None, [], workers=1):
         pass
+    assert asked == [False]

@@ -160,16 +160,11 @@ class Machine:
     def nthreads(self) -> dict[str, int]:
         return {"tcp://a": 1, "tcp://b": 1}
 
-    def restart_workers(self, workers: list[str], **_: object) -> None:
-        self.begun.append(f"restarted {len(workers)}")
 
-
-@pytest.mark.parametrize("alone", [True, False])
 @pytest.mark.parametrize("deaths", [1, 2])
-def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path, deaths, alone):
-    """In workers that were started anew, unless others may use them."""
+def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path, deaths):
     machine = Machine(big=deaths)
-    runner = StageRunner(machine, lambda *_: None, SimpleNamespace() if alone else None)
+    runner = StageRunner(machine, lambda *_: None)
     for name in ("big", "small", "other"):
         runner.begin(name, "mesh", {}, tmp_path / "lock", gib=2.34)
     ended = {}
@@ -178,7 +173,7 @@ def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path
         ended[name] = outcome
         if name == "small":
             runner.begin("next", "mesh", {}, tmp_path / "lock")
-    assert machine.begun == ["big", "small", "other", "next", *["restarted 2"] * alone, "big"]
+    assert machine.begun == ["big", "small", "other", "next", "big"]
     assert list(ended) == ["small", "other", "next", "big"]
     expected = (
         "It died. It was tried twice; by the estimate it needs 2.3 GiB of memory."
