@@ -305,7 +305,7 @@ def check_materials(mesh: TetMesh, materials: Materials) -> None:
         bare_regions = f"Give each region one: {', '.join(without)} has none." if without else ""
         raise InputError(
             f"Every cell needs exactly one material: {bare} cells have none and {twice} have more than one. "
-            f"{bare_regions or 'Regions must not share cells, and must have all of them.'}"
+            f"{bare_regions or 'Each cell must be in exactly one region.'}"
         )
 
 

@@ -101,9 +101,8 @@ def carried_images(found: Registration) -> CarriedImages:
     return CarriedImages(aligned, registered, local_rigid, local_after, similarity)
 
 
-def quality_of(found: Registration, maps: StrainMaps, made: Source, evidence: Evidence) -> Quality:
+def quality_of(found: Registration, maps: StrainMaps, similarity: Similarity, evidence: Evidence) -> Quality:
     """Quality and verdict of a registration."""
-    similarity = None if made.images is None else made.images.similarity
     points, floor, choice = evidence.landmarks, evidence.noise_floor, found.choice
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if points is None else target_registration_error(found.total, *points)

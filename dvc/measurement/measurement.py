@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -23,7 +23,7 @@ from dvc.measurement.judgement import Evidence, Source
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
-from dvc.report.drawing import Drawing, Rendered, png_bytes
+from dvc.report.drawing import Drawing, png_bytes
 from dvc.report.figures import Scale, coloured
 from dvc.report.page import Picture, Section, notebook_html
 from dvc.report.sheet import PLANES, Plane, View
@@ -67,8 +67,6 @@ class Measurement:
         Point where the slices in figures meet, LPS mm: the lowest point of the bone; None: the middle of the tissue.
     is_repeat : bool
         Whether it is of a repeat scan, whose strain is the noise floor.
-    rendered : mapping
-        Figures of `drawings` that are drawn already, by the names of their files.
 
     Examples
     --------
@@ -99,7 +97,6 @@ class Measurement:
     source: Source | None = None
     shown_mm: FloatArray | None = None
     is_repeat: bool = False
-    rendered: Mapping[str, Rendered] = field(default_factory=dict, repr=False)
 
     @classmethod
     def from_registration(
@@ -110,28 +107,25 @@ class Measurement:
         *,
         name: str = "load",
         is_repeat: bool = False,
-        draw: bool = False,
     ) -> Self:
         """Strain, verdict and error bars of a registered pair.
 
-        With ``is_repeat`` the loaded image is a repeat scan without load; its strain is the noise floor. With ``draw``
-        `write` has its figures ready: they are drawn while error bars are computed.
+        With ``is_repeat`` the loaded image is a repeat scan without load; its strain is the noise floor.
         """
-        more, at = evidence or Evidence(), subject.lowest_bone_point_mm
+        more = evidence or Evidence()
         # On two cores, as NumPy, SciPy and compiled loops let go of the interpreter.
         with ThreadPoolExecutor(1) as pool:
-            source = pool.submit(lambda: Source(subject, found.tissue, found, judgement.carried_images(found)))
+            carried = pool.submit(judgement.carried_images, found)
             maps = judgement.maps_of(found)
-            floor, early = more.noise_floor, draw and not is_repeat
-            drawn = pool.submit(lambda: page.rendered(at, source.result(), maps, floor) if early else {})
             bars = NO_ERROR_BARS if is_repeat else error_bars(found, subject, maps, more.error_model, more.twin)
-            made = source.result()
+            images = carried.result()
         if is_repeat:
             more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
-        quality, alignment = judgement.quality_of(found, maps, made, more), judgement.alignment_of(found)
+        quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
         regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
-        figures = found.deformation, maps, alignment, quality, regions, bars, found.reference, made, at, is_repeat
-        return cls(name, *figures, drawn.result())
+        source, at = Source(subject, found.tissue, found, images), subject.lowest_bone_point_mm
+        figures = found.deformation, maps, alignment, quality, regions, bars, found.reference, source, at, is_repeat
+        return cls(name, *figures)
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Self:
@@ -239,7 +233,8 @@ class Measurement:
     @property
     def headline(self) -> str:
         """The maximum shear strain of the region with most of it (median times volume), and the verdict, in a line."""
-        if not (rows := [r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median)]):
+        rows = [r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median)]
+        if not rows:
             return f"no maximum shear strain; {self.verdict.words}"
         most = max(rows, key=lambda r: r.median * r.volume_ml)
         strain = f"{most.median:z.3f} median, {most.p95:z.3f} at the 95th percentile"
@@ -322,20 +317,16 @@ class Measurement:
         tables = [replace(page.key_figures(self.quality, self.alignment), note=notes), page.region_table(self.regions)]
         tables += [] if self.is_repeat else weights
         tables += page.error_tables(bars)
+        first = [pictures[stem] for stem in ("strain", "curves")]
         others = [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
-        shown, short = (
-            (pictures["strain"], pictures["curves"], *others),
-            page.summary_table(self.regions, self.intervals),
-        )
-        return Section(self.name, self.verdict, tuple(tables), shown, pictures_first=True, summary=short)
+        short = page.summary_table(self.regions, self.intervals)
+        return Section(
+            self.name, self.verdict, tuple(tables), (*first, *others), pictures_first=True, summary=short
+        )  # fmt: skip
 
     def drawings(self) -> dict[str, Drawing]:
         """The figures of a report, by the name of their files; InputError for one that was read from a folder."""
-        made, floor = self._made_from(), self.quality.noise_floor
-        return page.drawings_of(self._view(), made, self.maps, floor) | self._drawing_of_sigma()
-
-    def _drawing_of_sigma(self) -> dict[str, Drawing]:
-        return page.drawing_of_sigma(self._view(), self._made_from().subject.reference, self.sigma)
+        return page.drawings_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
 
     def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
         """Write everything to a folder, complete or not at all; an older folder of that name is replaced.
@@ -360,11 +351,14 @@ class Measurement:
             If it cannot be written.
         """
         made, verdict, bars = self._made_from(), self.verdict, self.error_bars
-        found, told = made.registration, self.quality.as_dict() | {"alignment": dict(self.alignment)}
-        told |= {} if self.shown_mm is None else {_SHOWN: " ".join(map(str, self.shown_mm.tolist()))}
+        told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
+        found = made.registration
+        if self.shown_mm is not None:
+            told[_SHOWN] = " ".join(map(str, self.shown_mm.tolist()))
         if found is not None:
-            chosen = found.choice.as_dict()
-            told |= ({"regularisation": chosen} if chosen else {}) | {"error_of_max_shear": bars.as_dict()}
+            if chosen := found.choice.as_dict():
+                told["regularisation"] = chosen
+            told["error_of_max_shear"] = bars.as_dict()
         with whole_folder(Path(folder)) as partial, ThreadPoolExecutor(1) as pool:
             writing = [pool.submit(files.write_maps, partial, self.maps, made.subject.axes, verdict)]
             if found is not None and made.images is not None:
@@ -374,12 +368,12 @@ class Measurement:
                 writing.append(pool.submit(files.write_uncertainty, partial, grid, sure, bars.model, verdict))
             if (mesh := made.subject.mesh) is not None:  # in the same thread, as compiled kernels may not be in two
                 onto = pool.submit(files.write_mesh_results, partial, mesh, self.deformation, verdict)
-            (place := partial / files.FIGURES).mkdir()
-            left = self._drawing_of_sigma() if self.rendered else self.drawings()  # while files are made
-            shown: dict[str, Drawing | Rendered] = {**self.rendered, **left}
-            pictures = {stem: one.save(place / stem) for stem, one in shown.items()}
+            place = partial / files.FIGURES
+            place.mkdir()
+            pictures = {stem: one.save(place / stem) for stem, one in self.drawings().items()}  # while files are made
             write_regions_csv(partial / files.REGIONS, self.regions, verdict)
-            _ = [one.result() for one in writing]
+            for one in writing:
+                one.result()
             if mesh is not None:
                 told["mesh"] = onto.result()
             write_json(partial / files.QUALITY, told)
@@ -397,4 +391,9 @@ class Measurement:
 
     def _view(self, point_mm: npt.ArrayLike | None = None) -> View:
         """The slices through a point, through the bone's lowest point, or through the tissue's middle."""
-        return page.view_of(self.maps, self.shown_mm if point_mm is None else point_mm)
+        grid, valid = self.maps.grid, self.maps.valid
+        point = self.shown_mm if point_mm is None else point_mm
+        if point is None:
+            points = grid.points(valid if valid.any() else np.ones(grid.shape, dtype=bool))
+            point = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+        return View.through(grid, point, valid)

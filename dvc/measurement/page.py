@@ -5,16 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from dvc.arrays import Float32Array, FloatArray
+from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Image, LabelMap
 from dvc.measurement.error_bars import ErrorBars
 from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
-from dvc.report.drawing import Columns, Drawing, Rendered
+from dvc.report.drawing import Columns, Drawing
 from dvc.report.page import Cell, Table, shown
 from dvc.report.sheet import View
 from dvc.trust.error_model import Interval
@@ -37,8 +36,10 @@ _TWIN = (
 )
 
 
-def drawings_of(view: View, made: Source, maps: StrainMaps, floor: NoiseFloor | None) -> dict[str, Drawing]:
-    """The figures of a report, by the name of their files: agreement of the images, and strain.
+def drawings_of(
+    view: View, made: Source, maps: StrainMaps, floor: NoiseFloor | None, sigma: Float32Array | None
+) -> dict[str, Drawing]:
+    """The figures of a report, by the name of their files: agreement of the images, strain, and its uncertainty.
 
     The deformed grid lies over the loaded image where there is one.
     """
@@ -65,29 +66,10 @@ def drawings_of(view: View, made: Source, maps: StrainMaps, floor: NoiseFloor | 
     grid = view, below, maps.displacement_mm, None if bone is None else bone.inside
     drawn["deformed_grid"] = Drawing.of("Deformed grid", figures.deformed_grid, *grid)
     drawn["jacobian"] = Drawing.of("Volume ratio", figures.jacobian_slices, view, reference, maps.jacobian)
+    if sigma is not None:
+        spread = view, reference, sigma, SIGMA_SCALE
+        drawn["sigma"] = Drawing.of("Uncertainty of the maximum shear strain", figures.sigma_slices, *spread)
     return drawn
-
-
-def rendered(at_mm: FloatArray | None, made: Source, maps: StrainMaps, floor: NoiseFloor | None) -> dict[str, Rendered]:
-    """`drawings_of` the slices through a point as pictures."""
-    drawn = drawings_of(view_of(maps, at_mm), made, maps, floor)
-    return {stem: one.rendered() for stem, one in drawn.items()}
-
-
-def view_of(maps: StrainMaps, point_mm: npt.ArrayLike | None) -> View:
-    """The slices through a point, LPS mm, or through the middle of the tissue."""
-    if point_mm is None:
-        points = maps.grid.points(maps.valid if maps.valid.any() else np.ones(maps.grid.shape, dtype=bool))
-        point_mm = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
-    return View.through(maps.grid, point_mm, maps.valid)
-
-
-def drawing_of_sigma(view: View, reference: Image, sigma: Float32Array | None) -> dict[str, Drawing]:
-    """The figure of the uncertainty of the maximum shear strain, by the name of its files; none where it is unknown."""
-    if sigma is None:
-        return {}
-    shown = view, reference, sigma, SIGMA_SCALE
-    return {"sigma": Drawing.of("Uncertainty of the maximum shear strain", figures.sigma_slices, *shown)}
 
 
 def _curve_columns(maps: StrainMaps, labels: LabelMap) -> Columns:

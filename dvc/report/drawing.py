@@ -44,34 +44,10 @@ class Drawing:
         """The figure that ``draw`` makes of ``shown``; its docstring, which says how to read it, is the caption."""
         return cls(title, " ".join(f"{draw.__doc__ or ''} {note}".split()), draw(*shown), data)
 
-    def rendered(self) -> "Rendered":
-        """As pictures. The figures are then used up."""
-        beneath = tuple((name, png_bytes(one)) for name, one in self.beneath)
-        return Rendered(
-            Picture(self.title, self.caption, png_bytes(self.figure), beneath), _pdf_bytes(self.figure), self.data
-        )
-
     def save(self, stem: Path) -> Picture:
         """Write its files, as `save_figure`; the picture for a page."""
-        return self.rendered().save(stem)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rendered:
-    """A drawing as pictures, with the numbers in it."""
-
-    picture: Picture
-    pdf: bytes
-    data: Columns | None
-
-    def save(self, stem: Path) -> Picture:
-        """Write STEM.png, STEM.pdf, and STEM.csv if there are data; OutputError if a file cannot be written."""
-        for path, content in zip(figure_files(stem), (self.picture.png, self.pdf), strict=True):
-            with whole_file(path) as part:
-                part.write_bytes(content)
-        if self.data is not None:
-            write_csv(stem.with_name(f"{stem.name}.csv"), self.data, zip(*self.data.values(), strict=True))
-        return self.picture
+        png = save_figure(stem, self.figure, self.data)
+        return Picture(self.title, self.caption, png, tuple((name, png_bytes(one)) for name, one in self.beneath))
 
 
 def save_figure(stem: Path, figure: Figure, data: Columns | None = None) -> bytes:
@@ -79,7 +55,13 @@ def save_figure(stem: Path, figure: Figure, data: Columns | None = None) -> byte
 
     OutputError if a file cannot be written.
     """
-    return Drawing("", "", figure, data).save(stem).png
+    png = png_bytes(figure)
+    for path, content in zip(figure_files(stem), (png, _pdf_bytes(figure)), strict=True):
+        with whole_file(path) as part:
+            part.write_bytes(content)
+    if data is not None:
+        write_csv(stem.with_name(f"{stem.name}.csv"), data, zip(*data.values(), strict=True))
+    return png
 
 
 def figure_files(stem: Path) -> list[Path]:

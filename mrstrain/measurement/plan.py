@@ -59,7 +59,7 @@ class Plan:
         more = Evidence(noise_floor=floor) if is_repeat else replace(self.evidence, noise_floor=floor)
         evidence = replace(more, error_model=self.evidence.error_model, twin=twin)
         measured = dvc.Measurement.from_registration(
-            found, self.subject, evidence, name=folder.name, is_repeat=is_repeat, draw=True
+            found, self.subject, evidence, name=folder.name, is_repeat=is_repeat
         )
         return Case.of(measured, folder, self.record), measured.quality.noise_floor
 

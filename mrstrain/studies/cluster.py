@@ -91,10 +91,7 @@ class StageRunner:
         client.subscribe_topic(self._topic, lambda event: self._tell(*event[1]))
 
     def _tell(self, name: str, what: str, fraction: float) -> None:
-        if self._told.get(name) != (
-            what,
-            fraction,
-        ):  # the same again tells that its worker lives, and not that it goes on
+        if self._told.get(name) != (what, fraction):  # else its worker lives, but it may not go on
             self._silent_s[name] = 0.0
         self._told[name] = what, fraction
         self._watch(name, what, fraction)

@@ -95,7 +95,7 @@ def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
         raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
     if len(sizes) < 3:
         raise ImageFileError(
-            f"{path}: the image is {len(sizes)}D, {sizes} voxels; a 3D image is needed. Choose a volume."
+            f"{path}: the image is {len(sizes)}D, {sizes} voxels; a 3D image is needed. Give all slices in one file."
         )
     if len(sizes) > 4:
         raise ImageFileError(

@@ -10,6 +10,7 @@ from dvc.arguments import checked
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
 from dvc.io import StrPath
+from dvc.io.images.dicom import is_dicom, read_dicom
 from dvc.io.images.nifti import read_nifti_header
 from dvc.io.images.stored import MAX_BYTES, StoredVolume, Voxels
 from dvc.io.images.text_headers import read_meta_header, read_nrrd_header
@@ -57,7 +58,7 @@ def read_image(
     if min(grid.shape) < _MIN_SLICES:
         raise ImageFileError(
             f"{path}: the image has {' x '.join(map(str, grid.shape))} voxels. Strain in three dimensions needs at "
-            f"least {_MIN_SLICES} slices along each axis. Choose a volume."
+            f"least {_MIN_SLICES} slices along each axis. Give all of them in one file."
         )
     with np.errstate(over="ignore"):  # beyond single precision: infinite, and refused below
         values = np.ascontiguousarray(voxels, dtype=np.float32)
@@ -88,13 +89,10 @@ def read_voxels(
     place = Path(path)
     if not place.exists():
         raise InputError(f"{place}: no such file or folder. Check the path.")
-    if place.is_dir() or _known_suffix(place.name) is None:
-        from dvc.io.images.dicom import is_dicom, read_dicom  # pydicom takes a fifth of a second in every process
-
-        if place.is_dir() or is_dicom(place):
-            if volume is not None:
-                raise InputError(f"{place}: volume={volume} is for 4D files; for DICOM use series.")
-            return read_dicom(place, series=series, max_bytes=max_bytes)
+    if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):
+        if volume is not None:
+            raise InputError(f"{place}: volume={volume} is for 4D files; for DICOM use series.")
+        return read_dicom(place, series=series, max_bytes=max_bytes)
     if series is not None:
         raise InputError(f"{place}: series='{series}' is only for DICOM files and folders; this is neither.")
     stored = read_header(place, volume=volume, max_bytes=max_bytes)

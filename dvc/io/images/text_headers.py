@@ -76,7 +76,9 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     if _whole_numbers(path, fields, "dimension") != [len(sizes)]:
         raise ImageFileError(f"{path}: the header is damaged ({len(sizes)} sizes, {fields['dimension']} dimensions).")
     if len(sizes) < 3:
-        raise ImageFileError(f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed. Choose a volume.")
+        raise ImageFileError(
+            f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed. Give all slices in one file."
+        )
     steps = _steps(path, fields)
     if len(steps) != len(sizes):
         raise ImageFileError(f"{path}: the NRRD header gives {len(sizes)} sizes and {len(steps)} space directions.")
@@ -167,7 +169,9 @@ def read_meta_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     fields, end = _meta_fields(path)
     sizes = _whole_numbers(path, fields, "dimsize")
     if len(sizes) != 3 or fields.get("ndims") != "3":
-        raise ImageFileError(f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed. Choose a volume.")
+        raise ImageFileError(
+            f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed. Give all slices in one file."
+        )
     layout = (3, *sizes) if vectors else tuple(sizes)
     refuse_if_too_large(path, layout, max_bytes)
     pick_volume(path, 1, volume)

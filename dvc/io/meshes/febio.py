@@ -140,12 +140,8 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
         if taken < width:
             _log.warning(
                 "%s: of each element of %d nodes, the first %d are taken, as of %s. Between them, displacements may "
-                "differ from FEBio's.",
-                path,
-                width,
-                taken,
-                kind,
-            )
+                "differ from FEBio's.", path, width, taken, kind,
+            )  # fmt: skip
         rows = np.frombuffer(_at(domain, _ELEMENTS), "<u4").reshape(-1, width + 3)
         if not ((rows[:, 0] == _ELEMENT).all() and (rows[:, 1] == 4 * (width + 1)).all()):
             raise ValueError(f"an element in a domain of {kind} has a wrong number of nodes")

@@ -330,15 +330,3 @@ def test_maps_of_two_grids_are_refused(written, stretched, tmp_path):
     files.write_image(tmp_path / "Load1" / files.JACOBIAN, stretched.image)
     with pytest.raises(ImageFileError, match=r"jacobian\.nii\.gz: on another grid than max_shear"):
         dvc.Measurement.read(tmp_path / "Load1")
-
-
-def test_figures_that_were_drawn_beside_the_error_bars_are_those_drawn_for_the_files(measured, tmp_path):
-    found, subject = measured.source.registration, measured.source.subject
-    early = dvc.Measurement.from_registration(found, subject, name="early", draw=True)
-    late = replace(early, name="late", rendered={})
-    assert set(early.rendered) == set(late.drawings())
-    for one in (early, late):
-        one.write(tmp_path / one.name)
-    pictures = [sorted((tmp_path / one.name / files.FIGURES).iterdir()) for one in (early, late)]
-    assert len(pictures[0]) > 14
-    assert [(p.name, p.read_bytes()) for p in pictures[0]] == [(p.name, p.read_bytes()) for p in pictures[1]]

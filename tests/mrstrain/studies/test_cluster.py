@@ -1,4 +1,4 @@
-"""A cluster's address: loopback, or TLS with the certificate that docs/cluster.md makes; nothing else."""
+"""The cluster of a study: this machine's own, or at an address, on loopback or with TLS as docs/cluster.md says."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import dask
+import psutil
 import pytest
 
 from dvc.errors import InputError
 from mrstrain.studies.cluster import _refuse_unencrypted, cluster
+from mrstrain.studies.run import run
 from tests.processes import cluster_of_two
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
@@ -85,3 +87,35 @@ def test_settings_for_a_cluster_with_tls_leave_this_machines_own_alone(monkeypat
     with dask.config.set({"distributed.comm.require-encryption": True}), cluster(lambda *_: None, [], workers=1):
         pass
     assert asked == [False]
+
+
+def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path):
+    mark = str(tmp_path / "tried")
+
+    def lost_once() -> str:
+        if not os.path.exists(mark):
+            open(mark, "w").close()
+            os._exit(1)
+        return "done"
+
+    with cluster(lambda *_: None, [tmp_path], workers=2) as runner:
+        assert runner._client.submit(lost_once).result(timeout=60) == "done"
+        kept = runner._client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_", "freed arrays serve the next")
+        assert kept.result(timeout=60) == "freed arrays serve the next"
+
+
+def test_what_runs_a_study_is_reached_from_this_machine_alone(tmp_path):
+    with cluster(lambda *_: None, [tmp_path], workers=1):
+        family = psutil.Process(), *psutil.Process().children(recursive=True)
+        sockets = [one for process in family for one in process.net_connections("tcp")]
+    listening = [one.laddr.ip for one in sockets if one.status == psutil.CONN_LISTEN]
+    assert len(listening) >= 5  # the scheduler, its page, a nanny, a worker, and the worker's page
+    assert set(listening) == {"127.0.0.1"}
+
+
+def test_a_scheduler_that_is_not_there(images, tmp_path, monkeypatch):
+    monkeypatch.setattr("mrstrain.studies.cluster._CONNECT_S", 1.0)
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    with pytest.raises(InputError, match="No Dask scheduler"):
+        run(study, scheduler="tcp://127.0.0.1:1")

@@ -20,13 +20,12 @@ import psutil
 import pytest
 from filelock import FileLock
 
-from dvc.errors import InputError, OutputError
+from dvc.errors import OutputError
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image
 from fe import LoadStep
 from mrstrain import compare, mesh, register, simulate
 from mrstrain.studies.check import check
-from mrstrain.studies.cluster import cluster
 from mrstrain.studies.file import read_study
 from mrstrain.studies.init import init
 from mrstrain.studies.plan import plan
@@ -345,38 +344,6 @@ def test_a_cluster_whose_worker_is_killed_loses_nothing(done, tmp_path):
         assert areas(study) == pytest.approx(areas(folder), rel=1e-9)
         outcomes = (study / "results" / "study.log").read_text()
         assert "FAILED" not in outcomes
-
-
-def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path):
-    mark = str(tmp_path / "tried")
-
-    def lost_once() -> str:
-        if not os.path.exists(mark):
-            open(mark, "w").close()
-            os._exit(1)
-        return "done"
-
-    with cluster(lambda *_: None, [tmp_path], workers=2) as runner:
-        assert runner._client.submit(lost_once).result(timeout=60) == "done"
-        kept = runner._client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_", "freed arrays serve the next")
-        assert kept.result(timeout=60) == "freed arrays serve the next"
-
-
-def test_what_runs_a_study_is_reached_from_this_machine_alone(tmp_path):
-    with cluster(lambda *_: None, [tmp_path], workers=1):
-        family = psutil.Process(), *psutil.Process().children(recursive=True)
-        sockets = [one for process in family for one in process.net_connections("tcp")]
-    listening = [one.laddr.ip for one in sockets if one.status == psutil.CONN_LISTEN]
-    assert len(listening) >= 5  # the scheduler, its page, a nanny, a worker, and the worker's page
-    assert set(listening) == {"127.0.0.1"}
-
-
-def test_a_scheduler_that_is_not_there(images, tmp_path, monkeypatch):
-    monkeypatch.setattr("mrstrain.studies.cluster._CONNECT_S", 1.0)
-    study = tmp_path / "study"
-    shutil.copytree(images, study)
-    with pytest.raises(InputError, match="No Dask scheduler"):
-        run(study, scheduler="tcp://127.0.0.1:1")
 
 
 def test_check_tells_all_that_is_wrong_at_once(done, images, tmp_path):
