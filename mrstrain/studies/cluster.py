@@ -228,7 +228,7 @@ def cluster(
             return
         _refuse_unencrypted(scheduler)
         try:
-            client = Client(scheduler, timeout=_CONNECT_S)
+            client = _ClosedIfRefused(scheduler, timeout=_CONNECT_S)
         except (OSError, ValueError, TypeError) as error:  # the last without certificates
             raise InputError(
                 f"No Dask scheduler answers at {scheduler} ({error}). Start one as described in docs/cluster.md."
@@ -247,6 +247,21 @@ def cluster(
                 yield runner
             finally:
                 client.cancel(list(runner._under_way))
+
+
+class _ClosedIfRefused(Client):
+    """A client that is closed where it cannot connect, such as without a certificate.
+
+    Dask leaves that to the garbage collector. Where this happens while the thread of another client or cluster starts,
+    both wait for one lock, and that start fails after 10 s.
+    """
+
+    def __init__(self, address: str, timeout: float) -> None:
+        try:
+            super().__init__(address, timeout=timeout)
+        except BaseException:
+            self.close()
+            raise
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,6 +39,17 @@ def test_a_scheduler_on_a_network_needs_tls(address: str) -> None:
 )
 def test_loopback_and_tls_are_let_be(address: str) -> None:
     _refuse_unencrypted(address)
+
+
+def test_a_client_without_certificates_ends_its_thread() -> None:
+    """Dask's garbage ends it, and may do so while the thread of another cluster starts, which then waits for itself."""
+    before = set(threading.enumerate())
+    with (
+        pytest.raises(InputError, match="No Dask scheduler answers"),
+        cluster(lambda *_: None, [], scheduler="tls://127.0.0.1:1"),
+    ):
+        pass
+    assert not {thread.name for thread in set(threading.enumerate()) - before if thread.name == "IO loop"}
 
 
 @pytest.mark.skipif(not shutil.which("openssl"), reason="openssl is not installed")
