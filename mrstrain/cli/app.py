@@ -59,9 +59,9 @@ def _options(
 
 
 for _command in (
-    studies.init, studies.check, studies.run, studies.cohort, studies.demo, measurement.register, measurement.strain,
-    measurement.phantom, measurement.twin, measurement.accuracy, models.mesh, models.simulate, models.compare,
-    models.drive, models.level, models.converge, models.fit,
+    studies.init, studies.check, studies.run, studies.cohort, studies.demo, measurement.label, measurement.register,
+    measurement.strain, measurement.phantom, measurement.twin, measurement.accuracy, models.mesh, models.simulate,
+    models.compare, models.drive, models.level, models.converge, models.fit,
 ):  # fmt: skip
     app.command(cls=Grouped, epilog=EXAMPLES.get(_command.__name__))(_command)
 

@@ -8,12 +8,21 @@ import typer
 import mrstrain
 from mrstrain.cli.lines import say
 from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
-from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
+from mrstrain.options.measurement import BoneAndBody, MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.options.modelling import HeelShape
 
 SliceSpacing = Annotated[
     float | None, typer.Option(help="Voxel edge along the third axis, mm. Default: the same as --spacing.")
 ]
+
+
+@takes_options
+def label(
+    load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, enhanced DICOM, or a DICOM folder.")],
+    out: Annotated[Path, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.")], masks: BoneAndBody,
+) -> None:  # fmt: skip
+    """Make a label map of skin, fat, muscle and other bones from the unloaded image and a mask of its bone."""
+    tell(mrstrain.label.with_options(load0, out=out, masks=masks))
 
 
 @takes_options

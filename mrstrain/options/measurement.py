@@ -12,17 +12,22 @@ Frame = Literal["LPS", "RAS"]
 Unit = Literal["mm", "m"]
 
 
-class SubjectFiles(Options):
-    """What is known of the unloaded image: its bone, body and tissues."""
+class BoneAndBody(Options):
+    """Masks on the unloaded image."""
 
     panel: ClassVar[str] = "Inputs"
 
     bone: Path | None = None
     """Mask of the bone on the unloaded image; the rigid motion of this bone is removed."""
-    bone_label: str | None = None
-    """Name of the bone in --labels, instead of --bone."""
     tissue: Path | None = None
     """Mask of the body. Default: found by an intensity threshold."""
+
+
+class SubjectFiles(BoneAndBody):
+    """What is known of the unloaded image: its bone, body and tissues."""
+
+    bone_label: str | None = None
+    """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
     """Label map of the tissues on the unloaded image."""
     names: Path | None = None

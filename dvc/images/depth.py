@@ -1,0 +1,42 @@
+"""Depth below the border of a mask, finer than its voxels."""
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.special import ndtri
+
+from dvc.arrays import BoolArray, FloatArray
+
+_BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
+_SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
+_NEAR = 1.0  # voxels
+_EVEN = 0.7  # voxels
+_LEAST_MM = 0.05  # every voxel stays on its own side of the border
+NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm": _LEAST_MM}
+"""Every number that determines where a border lies, for a record."""
+
+
+def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
+    """Signed distance from a mask's border, mm, positive inside; the border is smooth, and not made of voxels' faces.
+
+    Blurred by a Gaussian of s, a plane's mask is the normal distribution of the distance over s, which gives the
+    distance near the border. Further away it is that to the nearest place of this border.
+    """
+    blurred = gaussian_filter(inside.astype(np.float64), _BLUR, mode="nearest")
+    sure = (blurred > _SURE) & (blurred < 1.0 - _SURE)
+    normal = np.stack([np.gradient(blurred, h, axis=axis)[sure] for axis, h in enumerate(spacing_mm)], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    near_mm = _BLUR * np.linalg.norm(normal * spacing_mm, axis=-1) * ndtri(blurred[sure])
+    depth, nearest = np.where(inside, 1.0, -1.0), np.abs(near_mm) < _NEAR * spacing_mm.mean()
+    if not nearest.any():  # one tissue fills everything
+        return np.asarray(depth * float(np.linalg.norm(np.array(inside.shape) * spacing_mm)))
+    seeds = np.zeros_like(inside)
+    seeds[sure] = nearest
+    border = np.argwhere(seeds) * spacing_mm - near_mm[nearest][:, None] * normal[nearest]
+    to = distance_transform_edt(~seeds, sampling=spacing_mm, return_distances=False, return_indices=True)
+    number = np.empty(inside.shape, dtype=np.int32)
+    number[seeds] = np.arange(len(border))
+    far = ~sure
+    depth[far] *= np.linalg.norm(np.argwhere(far) * spacing_mm - border[number[tuple(to[:, far])]], axis=-1)
+    depth[sure] = near_mm
+    depth = gaussian_filter(depth, _EVEN, mode="nearest")
+    return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))

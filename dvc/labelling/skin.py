@@ -1,0 +1,188 @@
+"""Skin: a layer at the surface of the body, darker than the tissue below it, whose thickness varies slowly."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.special import ndtr
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.images.depth import depth_mm
+from dvc.images.image import Image, Mask
+
+_DEPTHS_MM = np.arange(-2.0, 8.01, 0.5)  # of a profile, below the surface of the body
+_THICK_MM = np.arange(0.3, 5.01, 0.1)  # tried
+_SHIFTS = np.linspace(-1.0, 1.0, 17)  # tried, of the surface, in voxels
+_BLUR = 0.5  # voxels, standard deviation of an edge in a profile
+_WIDE_MM = 5.0  # standard deviation of the neighbourhood whose profile is fitted
+_BLOCK_MM = 2.5
+_VARIES_MM = 0.4  # standard deviation of the thickness over the body
+_LEVEL_WEIGHT = 0.02  # of what the levels are in the whole body, as a share of a profile
+_LEAST_CONTRAST = 0.15  # between skin and what is below it, as a share of the brightness of the latter
+_LEAST_SPREAD = 0.25  # voxels, of the border: where a voxel's centre lies is not known better from its brightness
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Skin:
+    """Where skin ends, below the surface of the body; all (ni, nj, nk), mm.
+
+    Attributes
+    ----------
+    depth_mm
+        Depth of each voxel below the surface of the body; negative outside.
+    border_mm
+        Depth of the inner border of skin, near each voxel.
+    spread_mm
+        Standard deviation of that depth.
+    """
+
+    depth_mm: FloatArray
+    border_mm: FloatArray
+    spread_mm: FloatArray
+
+    @classmethod
+    def of(cls, image: Image, body: Mask, without: BoolArray) -> Self | None:
+        """Skin of a body, or None where the image shows no darker layer at its surface.
+
+        The mean brightness in a neighbourhood of 5 mm (standard deviation), as a function of the depth below the
+        surface, is compared with profiles of air, a layer, and what is below it, with edges as sharp as voxels show
+        them. Thickness and brightness vary about those of the whole body.
+
+        Parameters
+        ----------
+        image : Image
+            Without its bias field.
+        body : Mask
+            On the image's grid.
+        without : (ni, nj, nk) bool
+            Voxels that are left out, such as bone, which is as dark as skin and may lie close below it.
+        """
+        spacing = image.grid.spacing_mm
+        depth = depth_mm(body.inside, spacing)
+        air = float(np.median(image.values[~binary_dilation(body.inside, iterations=4)]))
+        profiles = _Profiles.of(image, depth, ~without & np.isfinite(image.values))
+        voxel = float(spacing.mean())
+        values, weights = profiles.pooled()
+        whole = _fitted(values - air, weights, voxel, None)
+        skin, below = whole.levels[0]
+        if not _LEAST_CONTRAST * below < below - skin < below:
+            return None
+        values, weights = profiles.smoothed()
+        local = _fitted(values - air, weights, voxel, whole)
+        border, spread = (profiles.at_voxels(one, image.grid.shape) for one in (local.border_mm, local.spread_mm))
+        return cls(depth, border, np.hypot(spread, _LEAST_SPREAD * voxel))
+
+    @property
+    def probability(self) -> FloatArray:
+        """Probability (ni, nj, nk) that a voxel is less deep than the border; 1 outside the body."""
+        return np.asarray(ndtr((self.border_mm - self.depth_mm) / self.spread_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Profiles:
+    """Sums of brightness, and how many voxels, by depth in blocks of voxels: (i, j, k, depths)."""
+
+    sums: FloatArray
+    counts: FloatArray
+    block: tuple[int, ...]  # voxels of a block along each axis
+    spacing_mm: FloatArray
+
+    @classmethod
+    def of(cls, image: Image, depth: FloatArray, known: BoolArray) -> Self:
+        """Profiles of the voxels that are known; each counts for the two depths beside its own, by its distance."""
+        spacing, step = image.grid.spacing_mm, _DEPTHS_MM[1] - _DEPTHS_MM[0]
+        block = tuple(int(max(1, round(_BLOCK_MM / s))) for s in spacing)
+        shape = tuple(-(-n // b) for n, b in zip(image.grid.shape, block, strict=True))
+        near = np.argwhere(known & (depth > _DEPTHS_MM[0]) & (depth < _DEPTHS_MM[-1]))
+        place = np.ravel_multi_index(tuple((near // block).T), shape)
+        at = (depth[tuple(near.T)] - _DEPTHS_MM[0]) / step
+        first = at.astype(np.int64)
+        values = image.values[tuple(near.T)].astype(np.float64)
+        size, many = int(np.prod(shape)), len(_DEPTHS_MM)
+        sums, counts = np.zeros(size * many), np.zeros(size * many)
+        for bin_, share in ((first, 1.0 - (at - first)), (first + 1, at - first)):
+            index = place * many + bin_
+            counts += np.bincount(index, share, size * many)
+            sums += np.bincount(index, share * values, size * many)
+        return cls(sums.reshape(*shape, many), counts.reshape(*shape, many), block, spacing)
+
+    def pooled(self) -> tuple[FloatArray, FloatArray]:
+        """The one profile of all blocks (1, depths), and its weights."""
+        sums, counts = (one.reshape(-1, len(_DEPTHS_MM)).sum(axis=0) for one in (self.sums, self.counts))
+        return _profile(sums[None], counts[None])
+
+    def smoothed(self) -> tuple[FloatArray, FloatArray]:
+        """The profile around each block (blocks, depths), and its weights."""
+        sigma = (*(_WIDE_MM / (np.array(self.block) * self.spacing_mm)), 0.0)
+        both = (gaussian_filter(one, sigma, mode="constant", truncate=3.0) for one in (self.sums, self.counts))
+        seen = self.counts.any(axis=-1, keepdims=True)
+        return _profile(*((one * seen).reshape(-1, len(_DEPTHS_MM)) for one in both))
+
+    def at_voxels(self, values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+        """Values of blocks (n,), NaN where there are none, at voxels; each block has that of the nearest with one."""
+        blocks = values.reshape(self.counts.shape[:3])
+        lacking = np.isnan(blocks)
+        size = np.array(self.block) * self.spacing_mm
+        nearest = distance_transform_edt(lacking, sampling=size, return_distances=False, return_indices=True)
+        filled = blocks[tuple(nearest)]
+        at = [(np.arange(n) - 0.5 * (b - 1)) / b for n, b in zip(shape, self.block, strict=True)]
+        return np.asarray(map_coordinates(filled, np.meshgrid(*at, indexing="ij"), order=1, mode="nearest"))
+
+
+def _profile(sums: FloatArray, counts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean brightness by depth, and weights from 0 to 1: less where few voxels have that depth."""
+    typical = counts.max(axis=1, keepdims=True)
+    weights = np.where(typical > 1e-3, counts / (counts + 0.1 * np.maximum(typical, 1e-3)), 0.0)
+    return np.divide(sums, counts, out=np.zeros_like(sums), where=counts > 0.0), weights
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    border_mm: FloatArray  # (n,), NaN where a profile has no values
+    spread_mm: FloatArray
+    thickness_mm: FloatArray
+    levels: FloatArray  # (n, 2), of skin and of what is below it, above the air
+
+
+def _fitted(values: FloatArray, weights: FloatArray, voxel_mm: float, whole: "_Fit | None") -> _Fit:
+    """Fit profiles (n, depths) above the air: mean over the thicknesses tried, by how likely they are."""
+    known = (weights > 0.0).sum(axis=1) > 4
+    y, w = values[known], weights[known]
+    cost = np.full((len(_THICK_MM), len(y)), np.inf)
+    shift, levels = np.zeros(cost.shape), np.zeros((*cost.shape, 2))
+    total = np.einsum("nd,nd->n", w, y**2)
+    usual, hold = (np.zeros(2), 1e-6) if whole is None else (whole.levels[0], _LEVEL_WEIGHT)
+    for e in _SHIFTS * voxel_mm:
+        outer = ndtr((_DEPTHS_MM - e) / (_BLUR * voxel_mm))
+        for number, thick in enumerate(_THICK_MM):
+            inner = ndtr((_DEPTHS_MM - e - thick) / (_BLUR * voxel_mm))
+            base = np.stack([outer - inner, inner])
+            # Normal equations of the two levels, for all profiles at once.
+            aa, ab, bb = (w @ (base[i] * base[j]) for i, j in ((0, 0), (0, 1), (1, 1)))
+            ya, yb = ((w * y) @ one for one in base)
+            aa, bb, ya, yb = aa + hold, bb + hold, ya + hold * usual[0], yb + hold * usual[1]
+            determinant = aa * bb - ab**2
+            found = np.stack([(bb * ya - ab * yb) / determinant, (aa * yb - ab * ya) / determinant], axis=-1)
+            left = total + hold * (usual @ usual) - found[:, 0] * ya - found[:, 1] * yb
+            better = left < cost[number]
+            cost[number, better], shift[number, better], levels[number, better] = left[better], e, found[better]
+    # Where no profile fits, such as over bone close to skin, the thickness is that of the whole body.
+    own = cost.min(axis=0) / max(1.0, float(w.sum(axis=1).mean()) - 4.0)
+    odds = cost / (2.0 * np.maximum(own, np.median(own)) + 1e-12)
+    if whole is not None:
+        odds = odds + 0.5 * ((_THICK_MM - whole.thickness_mm[0]) / _VARIES_MM)[:, None] ** 2
+    likely = np.exp(odds.min(axis=0) - odds)
+    likely /= likely.sum(axis=0)
+    border = shift + _THICK_MM[:, None]
+    mean = (likely * border).sum(axis=0)
+    spread = np.sqrt((likely * (border - mean) ** 2).sum(axis=0))
+
+    def everywhere(some: FloatArray) -> FloatArray:
+        out = np.full(len(values), np.nan)
+        out[known] = some
+        return out
+
+    thickness = (likely * _THICK_MM[:, None]).sum(axis=0)
+    best = np.einsum("tn,tnc->nc", likely, levels)
+    return _Fit(everywhere(mean), everywhere(spread), everywhere(thickness), best)

@@ -1,0 +1,39 @@
+"""The figure of a label map that was made from an image: its tissues, and how sure they are."""
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import Normalize, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from dvc.arrays import Float32Array
+from dvc.images.image import Image, LabelMap
+from dvc.report.sheet import Sheet, View, window_of
+from dvc.report.style import SMALL, TISSUES, looks
+
+
+def label_slices(view: View, image: Image, labels: LabelMap, probability: Float32Array) -> Figure:
+    """Tissues in colour over the unloaded image, and the probability of the label of each voxel.
+
+    Dark places in the lower row are those to look at: there another tissue is about as likely.
+    """
+    sheet = Sheet(view, ["Tissues", "Probability of the label"], bar=True)
+    window, looked = window_of(view, image.values), looks(labels.names.values(), TISSUES)
+    colours = {number: looked[name].colour for number, name in labels.names.items()}
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, image.values, window)
+        cut = view.cut(labels.labels, plane)
+        page = np.zeros((*cut.shape, 4))
+        for number, colour in colours.items():
+            page[cut == number] = to_rgba(colour, 0.45)
+        sheet.paint(plane, axes, page, interpolation="nearest")
+    sure = np.where(labels.labels > 0, probability.max(axis=0), np.nan)
+    shades, norm = colormaps["cividis"], Normalize(0.5, 1.0)
+    for plane, axes in sheet.rows[1].items():
+        sheet.grey(plane, axes, image.values, window)
+        sheet.colours(plane, axes, sure, shades, norm)
+    sheet.bar(shades, norm, "probability of the label", "min")
+    named = [Patch(color=colours[number], alpha=0.6, label=name) for number, name in labels.names.items()]
+    last = list(sheet.rows[0].values())[-1]
+    last.legend(handles=named, loc="lower right", framealpha=0.8, prop={"family": SMALL["family"], "size": 8})
+    return sheet.finished()

@@ -1,0 +1,84 @@
+"""`label`: a label map of the tissues, from the unloaded image and a mask of its bone."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from dvc import label_tissues, read_image, read_mask, write_labels
+from dvc.atomic_files import write_json
+from dvc.errors import InputError, OutputError
+from dvc.io.images.write import write_vectors
+from dvc.report.drawing import ENDINGS, save_figure
+from dvc.report.labels import label_slices
+from dvc.report.sheet import View
+from mrstrain.options.door import door
+from mrstrain.options.measurement import BoneAndBody
+from mrstrain.records.inputs import image_stem, output_folder
+from mrstrain.records.outcome import Outcome
+from mrstrain.records.provenance import provenance
+
+_WRITTEN = (".nii.gz", ".nii", ".nrrd", ".mha")
+
+
+@door
+def label(load0: Path | str, *, out: Path | str, masks: BoneAndBody) -> Outcome:
+    """Label skin, fat, muscle and other bones of an unloaded image.
+
+    Parameters
+    ----------
+    load0 : path
+        Unloaded image.
+    out : path
+        The label map. Beside it are written the names (.csv), the probability of each tissue (STEM_probability), a
+        picture (.png, .pdf), and a record (.json).
+    masks
+        The bone is required.
+
+    Raises
+    ------
+    InputError, OutputError
+        Before anything is written: if no bone is given, a file cannot be read or does not fit, or an input would be
+        overwritten.
+    """
+    target, source = Path(out), Path(load0)
+    ending = next((one for one in _WRITTEN if target.name.lower().endswith(one)), None)
+    if ending is None:
+        raise InputError(f"The output (out) is the label map and must end in {', '.join(_WRITTEN)}; got {target}.")
+    if masks.bone is None:
+        raise InputError(
+            "label needs the mask of a bone (bone). Paint it in 3D Slicer or ITK-SNAP, and save it as NIfTI or NRRD."
+        )
+    stem = target.with_name(image_stem(target.name))
+    beside = [stem.with_name(stem.name + one) for one in (".csv", ".json", "_probability.json", *ENDINGS)]
+    probabilities = stem.with_name(f"{stem.name}_probability{ending}")
+    for path in (source, *masks.paths):
+        if path.resolve() in [one.resolve() for one in (target, probabilities, *beside)]:
+            raise OutputError(f"{path} is an input and would be overwritten. Choose another output file (out).")
+    began, image = time.perf_counter(), read_image(source)
+    bone = read_mask(masks.bone, image.grid)
+    made = label_tissues(image, bone, None if masks.tissue is None else read_mask(masks.tissue, image.grid))
+    names = tuple(made.labels.names.values())
+    record = provenance("label", {"load0": source, **{role: of[0] for role, of in masks.files.items()}}, {})
+    found = {"unsure": made.unsure, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
+    with output_folder(target.parent):
+        write_labels(target, made.labels)
+        write_vectors(
+            probabilities, image.grid, np.moveaxis(made.probability, 0, -1), names, "probability of each tissue",
+            frame="invariant", unit="1",
+        )  # fmt: skip
+        view = View.through(image.grid, bone.points()[np.argmin(bone.points()[:, 2])], made.labels.labels > 0)
+        save_figure(stem, label_slices(view, image, made.labels, made.probability))
+        write_json(beside[1], record | found)
+    voxel_ml = image.grid.voxel_volume_mm3 / 1000.0
+    volumes = ", ".join(
+        f"{name} {np.count_nonzero(made.labels.labels == number) * voxel_ml:.1f}"
+        for number, name in made.labels.names.items()
+    )
+    lines = (
+        f"Volumes, mL: {volumes}",
+        f"{made.unsure:.0%} of the voxels are unsure (probability below 90 %); {beside[-len(ENDINGS)]} shows where.",
+        *made.notes,
+        f"Label map: {target}",
+    )
+    return Outcome(target, lines)

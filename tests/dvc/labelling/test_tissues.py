@@ -1,0 +1,158 @@
+"""Tissues found in images: layers and balls whose place is known, and a heel whose every voxel is."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from dvc import Grid, Image, Mask, TissueLabels, label_tissues
+from dvc.arrays import BoolArray, FloatArray
+from dvc.errors import GeometryError, InputError
+from dvc.labelling.bones import other_bones
+from dvc.labelling.brightness import brighter_share, two_levels
+from dvc.labelling.skin import Skin
+from phantoms import Heel, heel_grid, labels_of, scan
+
+SPACING = np.array([1.0, 1.0, 1.0])
+
+
+def dice(a: BoolArray, b: BoolArray) -> float:
+    """Overlap of two masks: twice the common volume over the sum of both."""
+    return float(2.0 * np.count_nonzero(a & b) / (np.count_nonzero(a) + np.count_nonzero(b)))
+
+
+def shell(thick_mm: FloatArray | float, levels: tuple[float, float] = (300.0, 600.0), noise: float = 20.0) -> Image:
+    """A ball of 20 mm under a layer of its own brightness, averaged over voxels of 1 mm, with noise."""
+    fine = Grid((150, 150, 150), SPACING / 3.0, np.full(3, -24.8))
+    radius = np.linalg.norm(fine.points(), axis=-1)
+    values = np.select([radius < 20.0 - thick_mm, radius < 20.0], [levels[1], levels[0]], 0.0)
+    mean = values.reshape(50, 3, 50, 3, 50, 3).mean(axis=(1, 3, 5))
+    noisy = mean + np.random.default_rng(1).normal(0.0, noise, mean.shape)
+    return Image(Grid((50, 50, 50), SPACING, np.full(3, -24.8 + 1.0 / 3.0)), noisy)
+
+
+def skin_of(image: Image) -> tuple[Skin | None, FloatArray]:
+    """Skin of the ball, and the distance of each voxel from its middle."""
+    radius = np.linalg.norm(image.grid.points(), axis=-1)
+    return Skin.of(image, Mask(image.grid, radius < 20.0), np.zeros(image.grid.shape, dtype=bool)), radius
+
+
+@pytest.mark.parametrize("thick_mm", [1.2, 2.0, 3.5])
+def test_the_thickness_of_a_layer_is_found_to_a_quarter_of_a_voxel(thick_mm: float) -> None:
+    skin, radius = skin_of(shell(thick_mm))
+    assert skin is not None
+    at_border = np.abs(radius - (20.0 - thick_mm)) < 0.7
+    off = (skin.border_mm - skin.depth_mm - (radius - (20.0 - thick_mm)))[at_border]
+    assert np.abs(off.mean()) < 0.25
+    assert off.std() < 0.2
+    sure = np.abs(radius - (20.0 - thick_mm)) > 1.0
+    assert np.array_equal(
+        skin.probability[sure & (radius < 19.0)] > 0.5, (radius > 20.0 - thick_mm)[sure & (radius < 19.0)]
+    )
+
+
+def test_a_thickness_that_varies_is_followed() -> None:
+    fine = np.linspace(-24.8, 24.8, 150)
+    thick = 2.0 + 0.02 * fine[None, None, :]  # 1.6 mm below, 2.4 mm above
+    skin, radius = skin_of(shell(np.broadcast_to(thick, (150, 150, 150))))
+    assert skin is not None
+    z = np.broadcast_to(np.linspace(-24.5, 24.5, 50), radius.shape)
+    near = (radius > 16.5) & (radius < 18.5)
+    slope = np.polyfit(z[near], skin.border_mm[near], 1)[0]
+    assert 0.01 < slope < 0.03  # a layer of one thickness has 0
+
+
+def test_what_has_no_darker_layer_has_no_skin() -> None:
+    assert skin_of(shell(2.0, (600.0, 600.0)))[0] is None
+    assert skin_of(shell(2.0, (900.0, 600.0)))[0] is None
+    assert skin_of(shell(2.0, (400.0, 600.0)))[0] is not None
+
+
+def two_halves(noise: float, step: float = 200.0) -> tuple[FloatArray, BoolArray]:
+    values = np.full((40, 40, 40), 400.0)
+    bright = np.zeros(values.shape, dtype=bool)
+    bright[20:] = True
+    values[bright] += step
+    return (values + np.random.default_rng(2).normal(0.0, noise, values.shape)).astype(np.float32), bright
+
+
+def test_two_tissues_are_divided_through_noise_that_a_threshold_does_not_see_through() -> None:
+    values, bright = two_halves(noise=120.0)
+    where = np.ones(values.shape, dtype=bool)
+    levels = two_levels(values, where, SPACING)
+    assert levels is not None
+    assert (levels.darker, levels.brighter) == pytest.approx((400.0, 600.0), abs=30.0)
+    share = brighter_share(values, where, levels, SPACING)
+    assert dice(share > 0.5, bright) > 0.99
+    assert dice(values > levels.middle, bright) < 0.85
+    assert share[bright].min() > 0.3
+    assert np.mean(share[30:] > 0.95) > 0.95
+
+
+def test_one_tissue_is_not_divided() -> None:
+    values, _ = two_halves(noise=120.0, step=0.0)
+    textured = values + 200.0 * gaussian_filter(np.random.default_rng(3).normal(size=values.shape), 3.0).astype(
+        np.float32
+    )
+    where = np.ones(values.shape, dtype=bool)
+    assert two_levels(values, where, SPACING) is None
+    assert two_levels(textured, where, SPACING) is None
+    assert two_levels(np.zeros_like(values), where, SPACING) is None
+
+
+def test_marrow_in_a_dark_rim_is_bone_and_the_rim_with_it() -> None:
+    grid = Grid((50, 50, 50), SPACING, np.full(3, -24.5))
+    radius = np.linalg.norm(grid.points() - [5.0, 0.0, 0.0], axis=-1)
+    values = np.where(radius < 8.0, 700.0, np.where(radius < 10.0, 60.0, 600.0))
+    hole = (np.abs(grid.points()[..., 1]) < 1.0) & (np.abs(grid.points()[..., 2]) < 1.0) & (grid.points()[..., 0] > 5.0)
+    noise = np.random.default_rng(4).normal(0.0, 25.0, values.shape)
+    for seen in (values, np.where(hole, 600.0, values)):  # whole, and with a vessel through its rim
+        found = other_bones((seen + noise).astype(np.float32), np.ones(grid.shape, dtype=bool), 280.0, SPACING)
+        assert dice(found, radius < 10.0) > 0.97
+    assert not other_bones((600.0 + noise).astype(np.float32), np.ones(grid.shape, dtype=bool), 280.0, SPACING).any()
+
+
+@pytest.fixture(scope="module")
+def labelled() -> tuple[TissueLabels, FloatArray]:
+    """A heel at 1.2 mm, labelled from its bone alone; and its true labels."""
+    heel, grid = Heel(31), heel_grid(1.2)
+    truth = labels_of(heel, grid)
+    return label_tissues(scan(heel, grid, snr=25.0, number=0), truth.region("bone")), truth
+
+
+def test_tissues_of_a_heel(labelled) -> None:
+    made, truth = labelled
+    assert made.notes == ()
+    assert dict(made.labels.names) == {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
+    known = {name: truth.region(name).inside for name in truth.names.values()}
+    assert np.array_equal(made.labels.region("bone").inside, known["bone"])
+    assert dice(made.labels.region("fat").inside, known["fat"]) > 0.93
+    assert dice(made.labels.region("muscle").inside, known["muscle"] | known["tendon"]) > 0.93
+    assert dice(made.labels.region("skin").inside, known["skin"]) > 0.83
+    assert dice(made.labels.region("other bone").inside, known["ankle"]) > 0.93
+
+
+def test_probabilities_are_as_sure_as_they_are_right(labelled) -> None:
+    made, truth = labelled
+    total = made.probability.sum(axis=0)
+    inside = made.labels.labels > 0
+    assert total[inside] == pytest.approx(1.0, abs=1e-5)
+    assert total[~inside].max() == 0.0
+    soft = inside & np.isin(truth.labels, [2, 3, 4]) & np.isin(made.labels.labels, [2, 3, 4])
+    sure, right = made.probability.max(axis=0), made.labels.labels == truth.labels
+    for low, high in ((0.5, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.01)):
+        some = soft & (sure >= low) & (sure < high)
+        assert some.sum() > 1000
+        assert right[some].mean() > low - 0.1
+    assert right[soft & (sure < 0.7)].mean() < 0.8  # what is called unsure is wrong more often
+    assert 0.05 < made.unsure < 0.3
+
+
+def test_what_does_not_fit_is_refused(labelled) -> None:
+    grid = heel_grid(3.2)
+    image = scan(Heel(31), grid, snr=25.0, number=0)
+    far = Grid(grid.shape, grid.spacing_mm, grid.origin_mm + 500.0)
+    with pytest.raises(GeometryError, match="inside the image"):
+        label_tissues(image, Mask(far, np.ones(grid.shape, dtype=bool)))
+    whole = Mask(grid, np.ones(grid.shape, dtype=bool))
+    with pytest.raises(InputError, match="no soft tissue"):
+        label_tissues(image, whole)
