@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.special import ndtr
 from skimage.filters import threshold_otsu
 from skimage.restoration import denoise_tv_chambolle
@@ -38,8 +38,13 @@ def two_levels(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -
     spacing_mm : (3,)
         Voxel size.
     """
-    blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)[where].astype(np.float64)
-    if not blurred.size or not np.ptp(blurred) > 0.0:
+    whole = binary_erosion(where)  # without voxels that show a part of something else
+    if not whole.any():
+        return None
+    within, sigma = whole.astype(np.float32), _BLUR_MM / spacing_mm
+    share = gaussian_filter(within, sigma)[whole]
+    blurred = (gaussian_filter(values * within, sigma)[whole] / share).astype(np.float64)
+    if not np.ptp(blurred) > 0.0:
         return None
     middle = float(threshold_otsu(blurred))
     bright = blurred > middle

@@ -1,5 +1,6 @@
 """A label map from an image and the mask of its bone, with the probability of each tissue."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,7 +49,9 @@ class TissueLabels:
 
 
 @checked
-def label_tissues(image: Image, bone: Mask, body: Mask | None = None) -> TissueLabels:
+def label_tissues(
+    image: Image, bone: Mask, body: Mask | None = None, watch: Callable[[float], None] = lambda _: None
+) -> TissueLabels:  # fmt: skip
     """Label skin, fat, muscle and other bones of an unloaded image, given its bone.
 
     Skin is a darker layer at the surface of the body, whose thickness varies slowly. Other bones are bright marrow in
@@ -63,6 +66,8 @@ def label_tissues(image: Image, bone: Mask, body: Mask | None = None) -> TissueL
         The bone, on any grid of the image's frame.
     body : Mask, optional
         The body. Default: found by an intensity threshold.
+    watch : callable, optional
+        Told how far it is, from 0 to 1.
 
     Raises
     ------
@@ -77,7 +82,9 @@ def label_tissues(image: Image, bone: Mask, body: Mask | None = None) -> TissueL
     soft = whole & ~bone.inside
     if not soft.any():
         raise InputError("The bone leaves no soft tissue in the body. Check the masks.")
+    watch(0.1)
     even = fill_missing(without_bias_field(image))
+    watch(0.15)
     chance, notes = {"bone": bone.inside.astype(np.float32)}, list[str]()
     left = soft.astype(np.float32)  # probability that is not given to a tissue yet
     if (skin := Skin.of(even, Mask(grid, whole), bone.inside)) is None:
@@ -85,7 +92,9 @@ def label_tissues(image: Image, bone: Mask, body: Mask | None = None) -> TissueL
     else:
         chance["skin"] = np.where(soft, skin.probability, 0.0).astype(np.float32)
         left -= chance["skin"]
+    watch(0.5)
     chance |= _below_skin(even.values, soft & (left > 0.5), left, spacing)
+    watch(1.0)
     if "muscle" not in chance:
         notes.append("One tissue was found below the skin: its brightness does not separate fat from muscle.")
     names = {number: name for number, name in NAMES.items() if name in chance}

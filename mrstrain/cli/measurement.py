@@ -1,5 +1,6 @@
 """The commands that measure strain, and those that measure how accurately: phantoms, synthetic warps, their study."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,11 @@ def label(
     out: Annotated[Path, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.")], masks: BoneAndBody,
 ) -> None:  # fmt: skip
     """Make a label map of skin, fat, muscle and other bones from the unloaded image and a mask of its bone."""
-    tell(mrstrain.label.with_options(load0, out=out, masks=masks))
+    from mrstrain.records.progress import live
+
+    with live() as progress:
+        done = mrstrain.label.with_options(load0, out=out, masks=masks, watch=partial(progress, "label", "tissues"))
+    tell(done)
 
 
 @takes_options

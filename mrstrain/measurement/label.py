@@ -1,6 +1,7 @@
 """`label`: a label map of the tissues, from the unloaded image and a mask of its bone."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,9 @@ _WRITTEN = (".nii.gz", ".nii", ".nrrd", ".mha")
 
 
 @door
-def label(load0: Path | str, *, out: Path | str, masks: BoneAndBody) -> Outcome:
+def label(
+    load0: Path | str, *, out: Path | str, masks: BoneAndBody, watch: Callable[[float], None] | None = None
+) -> Outcome:  # fmt: skip
     """Label skin, fat, muscle and other bones of an unloaded image.
 
     Parameters
@@ -34,6 +37,8 @@ def label(load0: Path | str, *, out: Path | str, masks: BoneAndBody) -> Outcome:
         picture (.png, .pdf), and a record (.json).
     masks
         The bone is required.
+    watch
+        As in `dvc.label_tissues`.
 
     Raises
     ------
@@ -57,7 +62,8 @@ def label(load0: Path | str, *, out: Path | str, masks: BoneAndBody) -> Outcome:
             raise OutputError(f"{path} is an input and would be overwritten. Choose another output file (out).")
     began, image = time.perf_counter(), read_image(source)
     bone = read_mask(masks.bone, image.grid)
-    made = label_tissues(image, bone, None if masks.tissue is None else read_mask(masks.tissue, image.grid))
+    body = None if masks.tissue is None else read_mask(masks.tissue, image.grid)
+    made = label_tissues(image, bone, body, watch or (lambda _: None))
     names = tuple(made.labels.names.values())
     record = provenance("label", {"load0": source, **{role: of[0] for role, of in masks.files.items()}}, {})
     found = {"unsure": made.unsure, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}

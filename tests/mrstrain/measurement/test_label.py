@@ -1,0 +1,75 @@
+"""`label`: what it writes, that `register` takes it, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+import mrstrain
+from dvc import Image, read_image, read_labels, read_mask, write_image, write_mask
+from dvc.errors import InputError, OutputError
+from dvc.io.images.labels import read_names
+from phantoms import Heel, heel_grid, labels_of, scan
+
+
+@pytest.fixture(scope="module")
+def folder(made_once) -> Path:
+    def fill(place: Path) -> None:
+        heel, grid = Heel(41), heel_grid(1.6)
+        write_image(place / "Load0.nii.gz", scan(heel, grid, snr=25.0, number=0))
+        write_mask(place / "bone.nii.gz", labels_of(heel, grid).region("bone"))
+        told = mrstrain.label(place / "Load0.nii.gz", bone=place / "bone.nii.gz", out=place / "made" / "tissues.nii.gz")
+        (place / "told.txt").write_text("\n".join(told.summary()))
+
+    return made_once("labelled heel", fill)
+
+
+def test_everything_is_written_and_agrees(folder: Path) -> None:
+    made = folder / "made"
+    assert {path.name for path in made.iterdir()} == {
+        "tissues.nii.gz", "tissues.csv", "tissues.json", "tissues.png", "tissues.pdf",
+        "tissues_probability.nii.gz", "tissues_probability.json",
+    }  # fmt: skip
+    labels = read_labels(made / "tissues.nii.gz", made / "tissues.csv")
+    names = json.loads((made / "tissues_probability.json").read_text())["components"]
+    assert list(read_names(made / "tissues.csv").values()) == names
+    probability = nibabel.load(made / "tissues_probability.nii.gz").get_fdata()[..., 0, :]
+    numbers = np.array([number for name in names for number, known in labels.names.items() if known == name])
+    inside = labels.labels > 0
+    assert np.array_equal(numbers[probability.argmax(axis=-1)][inside], labels.labels[inside])
+    bone = read_mask(folder / "bone.nii.gz", read_image(folder / "Load0.nii.gz").grid)
+    assert np.array_equal(labels.region("bone").inside, bone.inside)
+    record = json.loads((made / "tissues.json").read_text())
+    assert record["command"] == "label"
+    assert record["inputs"]["bone"][0]["sha256"]
+    assert 0.0 < record["unsure"] < 0.5
+    told = (folder / "told.txt").read_text()
+    assert f"{record['unsure']:.0%} of the voxels are unsure" in told
+    assert told.endswith(f"Label map: {made / 'tissues.nii.gz'}")
+
+
+def test_what_cannot_be_labelled_is_refused_before_anything_is_written(folder: Path, tmp_path: Path) -> None:
+    load0, bone = folder / "Load0.nii.gz", folder / "bone.nii.gz"
+    with pytest.raises(InputError, match="needs the mask of a bone"):
+        mrstrain.label(load0, out=tmp_path / "a" / "t.nii.gz")
+    with pytest.raises(InputError, match=r"must end in \.nii\.gz"):
+        mrstrain.label(load0, bone=bone, out=tmp_path / "a" / "t.png")
+    with pytest.raises(OutputError, match="would be overwritten"):
+        mrstrain.label(load0, bone=bone, out=bone)
+    with pytest.raises(OutputError, match="would be overwritten"):
+        mrstrain.label(load0, bone=bone, out=folder / "Load0.nii.gz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_image_without_a_dark_surface_says_so(folder: Path, tmp_path: Path) -> None:
+    image, bone = read_image(folder / "Load0.nii.gz"), read_mask(folder / "bone.nii.gz")
+    labels = labels_of(Heel(41), image.grid)
+    even = np.where(labels.labels > 0, 500.0, 0.0) + np.random.default_rng(1).normal(0.0, 10.0, image.grid.shape)
+    write_image(tmp_path / "even.nii.gz", Image(image.grid, even))
+    write_mask(tmp_path / "bone.nii.gz", bone)
+    told = mrstrain.label(tmp_path / "even.nii.gz", bone=tmp_path / "bone.nii.gz", out=tmp_path / "t.nii.gz").summary()
+    assert any("No skin was found" in line for line in told)
+    assert any("One tissue was found" in line for line in told)
+    assert set(read_labels(tmp_path / "t.nii.gz", tmp_path / "t.csv").names.values()) == {"bone", "fat"}
