@@ -1,4 +1,4 @@
-"""The figure of a label map that was made from an image: its tissues, and how sure they are."""
+"""The figure of a label map that was made from an image: its tissues, and their probability."""
 
 import numpy as np
 from matplotlib import colormaps

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import label_tissues, read_image, read_mask, write_labels
+from dvc import label_tissues, read_image, read_mask, write_labels, write_vectors
 from dvc.atomic_files import write_json
 from dvc.errors import InputError, OutputError
-from dvc.io.images.write import write_vectors
 from dvc.report.drawing import ENDINGS, save_figure
 from dvc.report.labels import label_slices
 from dvc.report.sheet import View

@@ -84,15 +84,20 @@ class NewStudy:
         to_fill_in = [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
         todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
         lines += [f"Study file: {self.path}.{todo}", *to_fill_in, f"Next step: mrstrain check {self.path.parent}"]
-        lines += [] if found.labels or not found.loads else [self._measured_without_labels()]
+        lines += [] if found.labels or not found.loads else self._without_labels()
         return [*lines, f"Picture of what was found: {self.picture}"]
 
-    def _measured_without_labels(self) -> str:
-        """How to measure where the study has no label map."""
-        at = [self.path.parent / name for name in (self.inputs.load0 or "Load0.nii.gz", *self.inputs.loads.values())]
-        bone = self.path.parent / self.inputs.bone_mask if self.inputs.bone_mask else "BONE.nii.gz"
-        command = f"mrstrain register {' '.join(map(str, at))} --bone {bone} --out {self.path.parent / 'results'}"
-        return f"Without a label map, a mask of the bone is enough to measure: {command}"
+    def _without_labels(self) -> list[str]:
+        """How to go on where the study has no label map."""
+        place = self.path.parent
+        load0, *loads = (place / name for name in (self.inputs.load0 or "Load0.nii.gz", *self.inputs.loads.values()))
+        bone = place / self.inputs.bone_mask if self.inputs.bone_mask else "BONE.nii.gz"
+        made = f"mrstrain label {load0} --bone {bone} --out {place / 'tissues.nii.gz'}"
+        measured = f"mrstrain register {load0} {' '.join(map(str, loads))} --bone {bone} --out {place / 'results'}"
+        return [
+            f"To make a label map from the image and a mask of the bone, then init again: {made}",
+            f"Without a label map, a mask of the bone is enough to measure: {measured}",
+        ]
 
 
 Ask = Callable[[StudyInputs, Sequence[str], Path | str], Answers]

@@ -18,6 +18,7 @@ from mrstrain.cli.app import app
 from mrstrain.cli.options import _plain, takes_options
 from mrstrain.options import measurement, modelling
 from mrstrain.options.measurement import (
+    BoneAndBody,
     Cores,
     EngineOptions,
     MeshAndAxes,
@@ -77,6 +78,7 @@ TABLES: dict[type[Options], tuple[str, str]] = {  # table of the study file, and
 }
 NOT_IN_A_STUDY = {  # what a study has in its own way
     Scans: "repeat and allow_missing are keys of [images]; a start and landmarks belong to a single load",
+    BoneAndBody: "part of SubjectFiles; a label map is made before a study",
     MeshAndAxes: "its directions are the plate's",
     Cores: "told when it is run",
     Threads: "one for each stage",

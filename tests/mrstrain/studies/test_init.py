@@ -71,6 +71,7 @@ def test_without_a_label_map_it_says_how_to_measure_all_the_same(tmp_path, mask,
     images = " ".join(f"{tmp_path}/Load{n}.nii.gz" for n in range(3))
     command = f"mrstrain register {images} --bone {bone.format(tmp_path)} --out {tmp_path}/results"
     assert f"Without a label map, a mask of the bone is enough to measure: {command}" in told
+    assert any(line.startswith("To make a label map") and "mrstrain label" in line for line in told)
     assert not any("Without a label map" in line for line in NewStudy(tmp_path / "study.toml", LABELLED, "").summary())
 
 
