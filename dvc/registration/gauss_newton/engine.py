@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from dvc.deformation.protocol import Deformation
 from dvc.errors import ParameterError
+from dvc.images.tissue import bright_voxels
 from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Found, Progress
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.first_run import compile_loops
@@ -193,7 +195,10 @@ class GaussNewtonWithInterfaces(Engine):
             )
         if choice.frees_volume or pair.labels is None:
             return _volume_freed(self.name, choice)
-        share = float(np.mean(pair.labels.labels[pair.body.inside] == 0))
+        body, labelled = pair.body.inside, pair.labels.labels > 0
+        share = float(np.mean(~labelled[body]))
+        if share > _UNLABELLED:  # air in a generous mask does not count, nor voxels that show a part of labelled tissue
+            share = float(np.mean((bright_voxels(pair.fixed) & ~binary_dilation(labelled))[body]))
         if share <= _UNLABELLED:
             return ""
         return (

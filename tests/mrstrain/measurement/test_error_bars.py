@@ -13,6 +13,7 @@ from scipy.stats import foldnorm
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.images.noise import noise_of, signal_to_noise
+from dvc.images.tissue import widened
 from dvc.measurement.error_bars import TwinCheck, error_bars
 from dvc.measurement.judgement import with_caution
 from dvc.measurement.page import error_tables
@@ -188,6 +189,10 @@ def test_an_error_model_is_for_pairs_like_those_of_its_study() -> None:
     partly = replace(pair, labels=replace(labels, labels=unlabelled))
     assert "of the body has no label" in engine.unlike_study(partly, kept)
     assert "with a rigid bone" in engine.unlike_study(replace(partly, bone=None), freed)
+    generous = widened(body, 3.2)  # air around the tissue has no label, and needs none
+    assert np.mean(labels.labels[generous.inside] == 0) > 0.3
+    assert engine.unlike_study(replace(pair, body=generous), kept) == ""
+    assert "of the body has no label" in engine.unlike_study(replace(partly, body=generous), kept)
 
 
 def twin_of(maps: StrainMaps, sd: float, bias: float = 0.03) -> TwinCheck:
