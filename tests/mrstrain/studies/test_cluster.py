@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -107,7 +107,10 @@ def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path)
 def test_what_runs_a_study_is_reached_from_this_machine_alone(tmp_path):
     with cluster(lambda *_: None, [tmp_path], workers=1):
         family = psutil.Process(), *psutil.Process().children(recursive=True)
-        sockets = [one for process in family for one in process.net_connections("tcp")]
+        sockets = []
+        for process in family:
+            with suppress(psutil.NoSuchProcess):  # one of another test, which has just ended
+                sockets += process.net_connections("tcp")
     listening = [one.laddr.ip for one in sockets if one.status == psutil.CONN_LISTEN]
     assert len(listening) >= 5  # the scheduler, its page, a nanny, a worker, and the worker's page
     assert set(listening) == {"127.0.0.1"}
