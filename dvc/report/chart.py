@@ -58,7 +58,8 @@ def legend(axes: Axes, **where: Any) -> None:
     """Give a panel its legend, if anything in it has a label."""
     if axes.get_legend_handles_labels()[0]:
         font = FontProperties(family=FAMILY, size=SMALL_PT)
-        axes.legend(prop=font, labelcolor=INK, frameon=False, **where)
+        # Told to choose the place, matplotlib does not warn of it where that takes longer than a second.
+        axes.legend(prop=font, labelcolor=INK, frameon=False, **({"loc": "best"} | where))
 
 
 def colour_bar(axes: Axes, mapped: ScalarMappable, label: str, extend: str = "neither") -> None:

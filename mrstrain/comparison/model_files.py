@@ -9,6 +9,7 @@ from typing import Any
 from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.errors import ExtentError, InputError
+from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import read_json
 from mrstrain.options.modelling import ModelReading
@@ -52,18 +53,18 @@ def model_files(
     if not models:
         raise InputError("No model is given. A model is a folder with a file for each load, or a single file.")
     files: dict[str, list[ModelFile]] = {load: [] for load in loads}
-    notes, taken = list[str](), set[str]()
+    notes, taken = list[str](), list[str]()
     for place in models:
         name, chosen = _chosen(place, loads)
-        if name in taken:
-            raise InputError(f"Two models are named '{name}'; rename the folder of one of them.")
+        if twice := clash([*taken, name]):
+            raise InputError(f"Two models are named {twice}; rename the folder of one of them.")
         if not chosen:
             lacking = f"no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}"
             if len(models) == 1:
                 raise InputError(f"{place} has {lacking}.")
             notes.append(f"{name} has {lacking}; it is left out.")
             continue
-        taken.add(name)
+        taken.append(name)
         reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
         reading = _reading(place, usual, to_image)
         for load in loads:
