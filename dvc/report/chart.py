@@ -54,7 +54,7 @@ def number_axes(axes: Axes) -> None:
     axes.tick_params(labelsize=SMALL_PT, labelfontfamily=FAMILY, labelcolor=INK, which="both")
 
 
-def legend(axes: Axes, *, loc: str = "best", **where: Any) -> None:
+def legend(axes: Axes, *, loc: Any = "best", **where: Any) -> None:
     """Give a panel its legend, if anything in it has a label.
 
     With a place that is asked for, if only "best", matplotlib does not warn where a busy machine takes a second for it.
