@@ -64,7 +64,12 @@ def model_files(
                 raise InputError(f"{place} has {lacking}.")
             notes.append(f"{name} has {lacking}; it is left out.")
             continue
+<<<<<<< HEAD
         taken.append(name)
+=======
+        taken.add(name)
+        notes += _passed_over(name, chosen)
+>>>>>>> user29
         reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
         reading = _reading(place, usual, to_image)
         for load in loads:
@@ -110,6 +115,18 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
     if place.stem in _outcome(place, "reached"):
         raise InputError(f"{place} is a simulation of {place.stem}, but the measured load is {loads[0]}.")
     return place.stem, {loads[0]: place}
+
+
+def _passed_over(name: str, chosen: dict[str, Path]) -> list[str]:
+    """A sentence for each load of which another result lies beside the one that is compared."""
+    notes = []
+    for load, file in chosen.items():
+        results = (file.with_name(load + ending) for ending in ENDINGS)
+        beside = [other.name for other in results if other != file and other.is_file()]
+        if beside:
+            others = " and ".join(beside)
+            notes.append(f"{name}: {file.name} is compared, {others} is not. To compare it, move it to another folder.")
+    return notes
 
 
 def files_named(place: Path) -> list[Path]:

@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 import zlib
-from itertools import combinations
+from itertools import combinations, count
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -43,6 +43,11 @@ def slices() -> Figure:
     noise = np.random.default_rng(3).uniform(0.0, 1.0, grid.shape).astype(np.float32)
     view = View.through(grid, grid.centre_mm)
     return figures.strain_slices(view, Image(grid, noise), np.where(noise > 0.5, noise, np.nan), 0.5)
+
+
+def test_a_legend_on_a_slow_machine_is_no_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("matplotlib.legend.time", SimpleNamespace(perf_counter=count(step=2.0).__next__))
+    curve().savefig(tmp_path / "curve.png")  # warnings are errors here
 
 
 def test_a_pdf_holds_its_truetype_font_once_and_no_date(tmp_path: Path) -> None:

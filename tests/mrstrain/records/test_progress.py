@@ -35,6 +35,22 @@ def test_lines_come_now_and_then_with_the_time_left(clock: list[float], capsys: 
     ]
 
 
+def test_what_takes_longer_than_expected_is_never_called_done(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress.live() as told:
+        for second, fraction in ((0, 0.0), (20, 0.98), (40, 0.999), (200, 0.9999), (300, 1.0)):
+            clock[0] = 1000.0 + second
+            told("mesh", "meshing", fraction)
+    assert capsys.readouterr().err.splitlines() == [
+        "mesh: meshing 0 % after 0 s",
+        "mesh: meshing 98 % after 20 s",
+        "mesh: meshing 99 % after 40 s",
+        "mesh: meshing 99 % after 200 s, 2 s left",
+        "mesh: meshing 100 % after 300 s",
+    ]
+
+
 def test_cases_and_stages_have_clocks_of_their_own(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
     with progress.live() as told:
         told("Load1", "aligning", 0.0)
