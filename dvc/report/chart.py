@@ -61,12 +61,7 @@ def legend(axes: Axes, *, loc: Any = "best", **where: Any) -> None:
     """
     if axes.get_legend_handles_labels()[0]:
         font = FontProperties(family=FAMILY, size=SMALL_PT)
-<<<<<<< HEAD
-        # Told to choose the place, matplotlib does not warn of it where that takes longer than a second.
-        axes.legend(prop=font, labelcolor=INK, frameon=False, **({"loc": "best"} | where))
-=======
         axes.legend(prop=font, labelcolor=INK, frameon=False, loc=loc, **where)
->>>>>>> user29
 
 
 def colour_bar(axes: Axes, mapped: ScalarMappable, label: str, extend: str = "neither") -> None:

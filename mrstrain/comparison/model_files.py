@@ -64,12 +64,8 @@ def model_files(
                 raise InputError(f"{place} has {lacking}.")
             notes.append(f"{name} has {lacking}; it is left out.")
             continue
-<<<<<<< HEAD
         taken.append(name)
-=======
-        taken.add(name)
         notes += _passed_over(name, chosen)
->>>>>>> user29
         reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
         reading = _reading(place, usual, to_image)
         for load in loads:

@@ -45,11 +45,6 @@ def slices() -> Figure:
     return figures.strain_slices(view, Image(grid, noise), np.where(noise > 0.5, noise, np.nan), 0.5)
 
 
-def test_a_legend_on_a_slow_machine_is_no_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("matplotlib.legend.time", SimpleNamespace(perf_counter=count(step=2.0).__next__))
-    curve().savefig(tmp_path / "curve.png")  # warnings are errors here
-
-
 def test_a_pdf_holds_its_truetype_font_once_and_no_date(tmp_path: Path) -> None:
     save_figure(tmp_path / "curve.of.Load1", curve())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["curve.of.Load1.pdf", "curve.of.Load1.png"]
