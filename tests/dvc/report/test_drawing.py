@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 import zlib
-from itertools import combinations, count
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
