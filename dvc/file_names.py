@@ -1,5 +1,8 @@
 """Names of loads, material sets and models, which become names of files: none leads out of the folder of results."""
 
+import unicodedata
+from collections.abc import Iterable
+
 from dvc.errors import InputError
 
 _MOST_BYTES = 200  # file systems take 255, of which endings need some
@@ -20,6 +23,27 @@ def as_file_name(text: str) -> str:
     if len(text.encode(errors="replace")) > _MOST_BYTES:
         raise ValueError(f"becomes the name of a folder: {_MOST_BYTES} bytes are the most")
     return text
+
+
+def one_spelling(name: str) -> str:
+    """The same text for all names that some file systems take for one: without case, each accent stored in one way."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def clash(names: Iterable[str]) -> str:
+    """The first name that is there twice, or the first two that some file systems take for one; empty if all differ.
+
+    >>> clash(["Load1", "Load2", "Load1"])
+    "'Load1'"
+    >>> clash(["Load1", "load1"])
+    "'Load1' and 'load1' (case is ignored)"
+    """
+    seen: dict[str, str] = {}
+    for name in names:
+        if (first := seen.get(one_spelling(name))) is not None:
+            return f"'{name}'" if first == name else f"'{first}' and '{name}' (case is ignored)"
+        seen[one_spelling(name)] = name
+    return ""
 
 
 def refuse_as_file_name(of: str, name: str, where: str = "") -> None:

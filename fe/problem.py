@@ -13,7 +13,7 @@ from dvc import TetMesh
 from dvc.arguments import check_fields, checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
-from dvc.file_names import refuse_as_file_name
+from dvc.file_names import clash, refuse_as_file_name
 from dvc.mesh import repeated_rows
 from fe.elements import element as formulation
 from fe.materials import Materials
@@ -122,9 +122,10 @@ def paths_of(
     >>> [" ".join(load.name for load in path) for path in paths_of(loads)]
     ['Load1', 'Load2 Load3']
     """
-    names = [load.name for load in loads]
-    if not names or len(set(names)) < len(names):
-        raise InputError(f"At least one load is needed, and names must be unique; got {', '.join(names) or 'none'}.")
+    if not loads:
+        raise InputError("At least one load is needed.")
+    if twice := clash(load.name for load in loads):
+        raise InputError(f"Two loads are named {twice}; rename one of them.")
 
     def pressed(load: LoadStep) -> tuple[float, bool, Hashable]:
         return float(load.target.values[0]), bool(load.target.displaced[0]), directions.get(load.name)

@@ -13,6 +13,7 @@ from subprocess import DEVNULL, Popen
 from threading import Lock
 from typing import Any
 
+import psutil
 import pytest
 from filelock import FileLock, Timeout
 
@@ -38,6 +39,14 @@ def wait_for(condition: Callable[[], bool], process: Popen | None = None, limit_
         assert process is None or process.poll() is None, "it ended before"
         assert time.monotonic() - began < limit_s, "it took too long"
         time.sleep(0.2 if process else 0.02)
+
+
+def is_gone(process: int) -> bool:
+    """Whether a process has ended; what is left of it may wait for its parent, which need not look at once."""
+    try:
+        return psutil.Process(process).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 import tomllib
 import zipfile
 from importlib import import_module
@@ -98,13 +97,19 @@ def test_the_command_line_starts_without_the_heavy_libraries() -> None:
 
 
 def test_help_comes_in_under_a_second() -> None:
-    code = "import sys; sys.argv = ['mrstrain', '--help']; from mrstrain.__main__ import main; main()"
+    """Of processor time, since other programs take theirs from the clock."""
+    code = (
+        "import atexit, sys, time\n"
+        "atexit.register(lambda: print(time.process_time(), file=sys.stderr))\n"
+        "sys.argv = ['mrstrain', '--help']\n"
+        "from mrstrain.__main__ import main\n"
+        "main()"
+    )
     command = [sys.executable, "-c", code]
     times = []
-    for _ in range(3):  # the first may compile, and the machine may be busy
-        start = time.perf_counter()
+    for _ in range(3):  # the first may compile
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        times.append(time.perf_counter() - start)
         assert done.returncode == 0, done.stderr
+        times.append(float(done.stderr.splitlines()[-1]))
         assert "register" in done.stdout
     assert min(times) < 1.0

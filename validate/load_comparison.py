@@ -13,6 +13,7 @@ from dvc import Deformation, ErrorTable, LabelMap, Measurement, TetMesh, Verdict
 from dvc.arguments import check, check_fields, checked
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
+from dvc.file_names import clash
 from dvc.trust.error_model import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
@@ -124,9 +125,8 @@ class LoadCase:
         check(f"{self.load}: results", results, Sequence[FeResult])
         if not results:
             raise InputError(f"{self.load}: there is no model to compare.")
-        names = [NOTHING, *(result.name for result in results)]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise InputError(f"{self.load}: two models are named '{twice}'; rename one of them.")
+        if twice := clash([NOTHING, *(result.name for result in results)]):
+            raise InputError(f"{self.load}: two models are named {twice}; rename one of them.")
         return measured, results
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from dvc import LabelMap, TetMesh
 from dvc.arguments import checked
 from dvc.errors import GeometryError, InputError
+from dvc.file_names import clash
 from dvc.mesh import box_told, repeated_rows
 from dvc.worker import Each
 from validate.fe_result import FeResult, check_overlap
@@ -42,8 +43,8 @@ def check_models(
     check_bones(labels, bones)
     if not cases:
         raise InputError("There is no load to compare; at least one case is needed.")
-    if len({case.load for case in cases}) < len(cases):
-        raise InputError(f"Loads must have different names; got {', '.join(case.load for case in cases)}.")
+    if twice := clash(case.load for case in cases):
+        raise InputError(f"Two loads are named {twice}; rename one of them.")
     return [odd for of in each(partial(_odd_models, labels=labels, bones=bones), cases) for odd in of]
 
 

@@ -148,15 +148,22 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
 
 
 def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
-    """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known."""
-    known = {(i.region, i.figure): f" ({shown(i.low)} to {shown(i.high)})" for i in intervals}
+    """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known.
+
+    All to three decimals, as in the summary of the command: the eye then compares them down a column.
+    """
+
+    def told(strain: float) -> str:
+        return f"{strain:z.3f}" if np.isfinite(strain) else shown(strain)
+
+    known = {(i.region, i.figure): f" ({told(i.low)} to {told(i.high)})" for i in intervals}
     rows = tuple(
-        (r.region, *(shown(getattr(r, figure)) + known.get((r.region, figure), "") for figure in ("median", "p95")))
+        (r.region, *(told(getattr(r, figure)) + known.get((r.region, figure), "") for figure in ("median", "p95")))
         for r in regions
         if r.quantity == "max_shear"
     )
     note = "In brackets: 95 % interval, from the error model." if known else ""
-    return Table("Maximum shear strain", ("tissue", "median", "95th percentile"), rows, note)
+    return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 
 
 def error_tables(bars: ErrorBars) -> list[Table]:

@@ -54,11 +54,14 @@ def number_axes(axes: Axes) -> None:
     axes.tick_params(labelsize=SMALL_PT, labelfontfamily=FAMILY, labelcolor=INK, which="both")
 
 
-def legend(axes: Axes, **where: Any) -> None:
-    """Give a panel its legend, if anything in it has a label."""
+def legend(axes: Axes, *, loc: Any = "best", **where: Any) -> None:
+    """Give a panel its legend, if anything in it has a label.
+
+    With a place that is asked for, if only "best", matplotlib does not warn where a busy machine takes a second for it.
+    """
     if axes.get_legend_handles_labels()[0]:
         font = FontProperties(family=FAMILY, size=SMALL_PT)
-        axes.legend(prop=font, labelcolor=INK, frameon=False, **where)
+        axes.legend(prop=font, labelcolor=INK, frameon=False, loc=loc, **where)
 
 
 def colour_bar(axes: Axes, mapped: ScalarMappable, label: str, extend: str = "neither") -> None:

@@ -8,7 +8,7 @@ that deviation. This holds for tissue that is strained and imaged like the study
 
 import json
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -364,9 +364,14 @@ def _figures_drawn(
         of_tissues = zip(np.split(truth, ends[:-1]), volumes_ml, strict=True)
         return [figures_of(shear, volume) for shear, volume in of_tissues]
 
-    with ThreadPoolExecutor(1) as beside:  # figures of one truth while the next is drawn
-        drawn = list(beside.map(figures, (draws.drawn() for _ in range(_DRAWS))))
-    return np.swapaxes(drawn, 0, 1)
+    begun = list[Future[list[FloatArray]]]()
+    with ThreadPoolExecutor(1) as beside:
+        for _ in range(_DRAWS):
+            truth = draws.drawn()  # while the figures of the one before are computed
+            if begun:
+                begun[-1].result()  # so that no more than two are in memory
+            begun.append(beside.submit(figures, truth))
+        return np.swapaxes([one.result() for one in begun], 0, 1)
 
 
 def _voxels_apart(body: BoolArray, about: FloatArray) -> list[int]:

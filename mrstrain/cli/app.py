@@ -63,7 +63,9 @@ for _command in (
     measurement.strain, measurement.phantom, measurement.twin, measurement.accuracy, models.mesh, models.simulate,
     models.compare, models.drive, models.level, models.converge, models.fit,
 ):  # fmt: skip
-    app.command(cls=Grouped, epilog=EXAMPLES.get(_command.__name__))(_command)
+    # The list of commands has the whole first paragraph of each, not as much of it as fits on a line.
+    _first = " ".join((_command.__doc__ or "").split("\n\n")[0].split())
+    app.command(cls=Grouped, short_help=_first, epilog=EXAMPLES[_command.__name__])(_command)
 
 
 @app.command()

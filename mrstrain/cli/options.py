@@ -3,6 +3,7 @@
 import functools
 import inspect
 import operator
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import UnionType
@@ -34,13 +35,26 @@ Workers = Annotated[
 EXAMPLES = {
     command: f"\b\nExample:\n  mrstrain {command} {given}"
     for command, given in {
+        "init": "subject01",
+        "check": "subject01",
+        "run": "subject01",
+        "cohort": "subject01 subject02 --out cohort",
+        "demo": "--out demo",
         "register": "Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --out results",
+        "strain": "Load0.nii.gz TransformParameters.1.txt --bone calcaneus.nii.gz --out strained",
+        "phantom": "--load Load1 --spacing 1.2 --out heel",
+        "twin": "Load0.nii.gz TransformParameters.1.txt --bone calcaneus.nii.gz --out twin",
+        "accuracy": "--spacing 1.0 --snr 20 --motion still --motion smooth --out accuracy",
+        "mesh": "tissues.nii.gz --names tissues.csv --edge-mm 2 --out heel.vtu",
         "simulate": "heel.vtu --set trebbi --load Load1=115 --out simulated",
         "compare": "results simulated/trebbi --out compared",
+        "drive": "heel.vtu results --set trebbi --out driven",
         "level": "results simulated/trebbi --out levelled",
+        "converge": "tissues.nii.gz --names tissues.csv --edge-mm 4 --edge-mm 2.6 --edge-mm 1.9 --out converged",
+        "fit": "curve.csv --law Ogden --test uniaxial --out fitted",
     }.items()
 }
-"""The end of a command's help, by command."""
+"""The end of a command's help, by command. Files have the names that `mrstrain phantom` gives them."""
 
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
 
@@ -78,10 +92,20 @@ class Grouped(TyperCommand):
         for one in self.get_params(ctx):
             usual = "Arguments" if one.param_type_name == "argument" else "Options"
             if line := one.get_help_record(ctx):
-                groups.setdefault(getattr(one, "rich_help_panel", None) or usual, []).append(line)
+                name, told = line
+                group = getattr(one, "rich_help_panel", None) or usual
+                groups.setdefault(group, []).append((_plainly(name), told))
         for name in sorted(groups, key=_GROUPS.index):
             with formatter.section(name):
                 formatter.write_dl(groups[name])
+
+
+def _plainly(name: str) -> str:
+    """Name of an option with the kinds of its values as a person calls them, not as Python does."""
+    kinds = {"str": "text", "Path": "path", "path": "path", "int": "number", "float": "number"}
+    name = re.sub(r"<list\[(\w+)\]>", r"<\1>", name)
+    row = re.sub(r"<([\w,]+)>\.\.\.", lambda found: " ".join(f"<{kind}>" for kind in found[1].split(",")), name)
+    return re.sub(r"<(\w+)(?: range)?>", lambda found: f"<{kinds.get(found[1], found[1])}>", row)
 
 
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -116,9 +140,11 @@ def _offered(model: type[Options], field: str, info: FieldInfo) -> inspect.Param
     if kind is bool:
         default = default != cli.off
     several = " Repeat for several." if get_origin(kind) is list else ""
+    told = " ".join((cli.help or info.description or "").split()) + several
     option = typer.Option(
         *(() if kind == bool | None else (name,)),  # without a name typer offers its negation as well
-        help=" ".join((cli.help or info.description or "").split()) + several,
+        help=told,
+        show_default="Default: " not in told,
         rich_help_panel=cli.panel or model.panel,
         min=next((least for check in metadata if (least := getattr(check, "ge", None)) is not None), None),
     )

@@ -9,6 +9,7 @@ from typing import Any
 from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.errors import ExtentError, InputError
+from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import read_json
 from mrstrain.options.modelling import ModelReading
@@ -52,18 +53,19 @@ def model_files(
     if not models:
         raise InputError("No model is given. A model is a folder with a file for each load, or a single file.")
     files: dict[str, list[ModelFile]] = {load: [] for load in loads}
-    notes, taken = list[str](), set[str]()
+    notes, taken = list[str](), list[str]()
     for place in models:
         name, chosen = _chosen(place, loads)
-        if name in taken:
-            raise InputError(f"Two models are named '{name}'; rename the folder of one of them.")
+        if twice := clash([*taken, name]):
+            raise InputError(f"Two models are named {twice}; rename the folder of one of them.")
         if not chosen:
             lacking = f"no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}"
             if len(models) == 1:
                 raise InputError(f"{place} has {lacking}.")
             notes.append(f"{name} has {lacking}; it is left out.")
             continue
-        taken.add(name)
+        taken.append(name)
+        notes += _passed_over(name, chosen)
         reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
         reading = _reading(place, usual, to_image)
         for load in loads:
@@ -109,6 +111,18 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
     if place.stem in _outcome(place, "reached"):
         raise InputError(f"{place} is a simulation of {place.stem}, but the measured load is {loads[0]}.")
     return place.stem, {loads[0]: place}
+
+
+def _passed_over(name: str, chosen: dict[str, Path]) -> list[str]:
+    """A sentence for each load of which another result lies beside the one that is compared."""
+    notes = []
+    for load, file in chosen.items():
+        results = (file.with_name(load + ending) for ending in ENDINGS)
+        beside = [other.name for other in results if other != file and other.is_file()]
+        if beside:
+            others = " and ".join(beside)
+            notes.append(f"{name}: {file.name} is compared, {others} is not. To compare it, move it to another folder.")
+    return notes
 
 
 def files_named(place: Path) -> list[Path]:

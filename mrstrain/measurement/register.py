@@ -11,6 +11,7 @@ import numpy as np
 
 from dvc import Deformation, Engine, Evidence, Image, Settings, read_error_model, read_image, read_landmarks
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
+from dvc.file_names import one_spelling
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
 from dvc.registration.align import align as align_images, without_motion
 from dvc.registration.engines import DEFAULT
@@ -168,7 +169,7 @@ def _places(loads: list[Path], scans: Scans) -> dict[str, Path]:
     places = dict(zip(case_names(loads), loads, strict=True))
     if scans.repeat is None:
         return places
-    if REPEAT in places:
+    if REPEAT in map(one_spelling, places):
         raise InputError(f"A loaded image is named '{REPEAT}', which is reserved for the repeat scan; rename it.")
     return places | {REPEAT: scans.repeat}
 

@@ -14,6 +14,7 @@ import numpy as np
 import fe
 from dvc.atomic_files import remove_partial, write_whole
 from dvc.errors import InputError, MrstrainError, OutputError, WorkerError
+from dvc.file_names import clash
 from dvc.own_files import read_json
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
@@ -166,10 +167,10 @@ def loads_named(texts: Sequence[str] | None) -> Sequence[fe.LoadStep]:
 def material_sets(names: Sequence[str]) -> list[fe.MaterialSet]:
     """Material sets by published name or file; at least one is needed, each only once."""
     chosen = [fe.material_set(name) for name in names]
-    if not chosen or len({one.name for one in chosen}) < len(chosen):
-        raise InputError(
-            f"At least one material set is needed, and each only once; got {', '.join(map(str, names)) or 'none'}."
-        )
+    if not chosen:
+        raise InputError("At least one material set is needed.")
+    if twice := clash(one.name for one in chosen):
+        raise InputError(f"Two material sets are named {twice}; give each only once, or rename one.")
     return chosen
 
 

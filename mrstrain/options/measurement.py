@@ -121,7 +121,7 @@ class Threads(Options):
     panel: ClassVar[str] = "Advanced"
 
     threads: Count | None = None
-    """Threads per worker. Default: all cores. elastix reproduces its results only with the same number of threads."""
+    """Threads per worker. Default: all cores."""
 
 
 class Cores(Threads):
@@ -134,11 +134,13 @@ class Cores(Threads):
 class Seeded(Threads):
     """Number of threads, and the seed of random numbers."""
 
+    threads: Count | None = None
+    """Threads per worker. Default: all cores. elastix reproduces its results only with the same number of threads."""
     seed: Count = 1
     """Seed of all random numbers."""
 
 
-class Running(Cores, Seeded):
+class Running(Seeded, Cores):
     """Number of threads, loads at the same time, and the seed of random numbers."""
 
     def shares(self, loads: int) -> tuple[int, int]:

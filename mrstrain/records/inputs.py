@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 from dvc import Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
 from dvc.arrays import FloatArray
 from dvc.errors import InputError, OutputError
-from dvc.file_names import refuse_as_file_name
+from dvc.file_names import clash, refuse_as_file_name
 from dvc.io.images.write import refuse_overwriting_inputs
 from dvc.io.result_folder import REPORT
 from dvc.measurement.subject import plate_directions
@@ -89,8 +89,7 @@ def case_names(loads: Sequence[Path]) -> list[str]:
     names = [image_stem(path.name) for path in loads]
     for name, path in zip(names, loads, strict=True):
         refuse_as_file_name("load", name, str(path))
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
+    if twice := clash(names):
         raise InputError(
             f"Each loaded image gets a results folder of its file name, but {twice} would be used twice. Rename the "
             "files, or use different output folders (out)."

@@ -27,6 +27,7 @@ NOTE = "note"
 _LINE_EVERY_S = 15.0
 _LINE_OF_ALL_EVERY_S = 60.0
 _LEAST_SHARE = 0.02
+_MOST_SHARE = 0.99  # of what is not done: no line says 100 % while work goes on
 
 
 @contextmanager
@@ -99,7 +100,7 @@ def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
                 if not of_all:  # parts of a case that is no stage of a study begin at 0 each
                     display.reset(bars[case], total=1.0)
                 display.update(bars[case], description=f"{case}: {stage}")
-            display.update(bars[case], completed=fraction, visible=visible)
+            display.update(bars[case], completed=_short_of_all(fraction), visible=visible)
             if of_all and not visible:
                 console.print(f"{case}: {stage}", markup=False, highlight=False)
 
@@ -143,6 +144,11 @@ def _lines_of_all() -> OnProgress:
 
 
 def _print(case: str, stage: str, fraction: float, spent_s: float) -> None:
-    known = 0.1 <= fraction < 1.0 and spent_s >= 1.0  # the first part of a stage may be known at once
-    left = f", {spent_s * (1 - fraction) / fraction:.0f} s left" if known else ""
-    print(f"{case}: {stage} {100 * fraction:.0f} % after {spent_s:.0f} s{left}", file=sys.stderr, flush=True)
+    share = _short_of_all(fraction)
+    left_s = spent_s * (1.0 - share) / share if share >= 0.1 and spent_s >= 1.0 else 0.0  # a first part: known at once
+    left = f", {left_s:.0f} s left" if left_s >= 1.0 else ""
+    print(f"{case}: {stage} {100 * share:.0f} % after {spent_s:.0f} s{left}", file=sys.stderr, flush=True)
+
+
+def _short_of_all(fraction: float) -> float:
+    return fraction if fraction >= 1.0 else min(fraction, _MOST_SHARE)

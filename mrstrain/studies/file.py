@@ -11,7 +11,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
-from dvc.file_names import as_file_name
+from dvc.file_names import as_file_name, clash, one_spelling
+from dvc.io.result_folder import REPEAT
 from mrstrain.options import modelling
 from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFiles, Unit
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
@@ -215,8 +216,10 @@ def read_study(path: Path | str | Study) -> Study:
             f"{place}: [study] out = '{study.study.out}' is not below the folder of the study ({study.place}). Choose "
             "a folder below it."
         )
-    if "repeat" in study.loads:
-        raise InputError(f"{place}: the name 'repeat' is reserved for the repeat scan; rename this load.")
+    if REPEAT in map(one_spelling, study.loads):
+        raise InputError(f"{place}: the name '{REPEAT}' is reserved for the repeat scan; rename this load.")
+    if twice := clash(study.loads):
+        raise InputError(f"{place}: two loads are named {twice}; rename one of them.")
     return study
 
 

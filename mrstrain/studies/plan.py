@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from dvc.errors import InputError
+from dvc.file_names import clash
 from dvc.io.result_folder import REPEAT
 from fe import BONE, LoadStep, material_set
 from mrstrain.comparison.drive import ENDING
@@ -72,11 +73,12 @@ def plan(study: Study) -> tuple[Stage, ...]:
     for one in study.models.sets:
         own = [_simulation(study, one)]
         folder = own[0].gives[0]
-        if folder in models.values():
-            raise InputError(f"[models] sets: two material sets are named '{folder.name}'; rename one.")
         if study.models.drive:
             driven, dvc = study.out / MODELS / (folder.name + ENDING), {"dvc": study.out / REGISTRATION}
             own.append(_on_mesh(study, f"drive {folder.name}", one, driven, dvc, {"loads": measured}))
+        earlier = dict.fromkeys(place.name for place in models.values())
+        if twice := clash([*earlier, *(stage.gives[0].name for stage in own)]):
+            raise InputError(f"[models] sets: two material sets are named {twice}; rename one.")
         models |= {stage.name: stage.gives[0] for stage in own}
         if study.models.level:
             own += [_levelled(study, folder, load) for load in load_steps(study)]
@@ -224,11 +226,9 @@ def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, 
     how = study.compare.located(study.place)
     labels, names = study.path(study.images.labels), study.optional_path(study.images.names)
     elsewhere = [study.path(place) for place in study.models.results]
-    taken = {place.name for place in models.values()}
-    if twice := [place.name for place in elsewhere if place.name in taken]:
-        raise InputError(
-            f"[models] a folder of results and another model are both named '{twice[0]}'; rename the folder."
-        )
+    simulated = dict.fromkeys(place.name for place in models.values())
+    if twice := clash([*simulated, *(place.name for place in elsewhere)]):
+        raise InputError(f"[models] results: a folder and another model are named {twice}; rename the folder.")
     arguments = {
         "dvc": study.out / REGISTRATION, "out": study.out / COMPARISON, "labels": labels, "names": names,
         "bones": study.mesh.bones, **study.plate.narrowed(Directions).model_dump(), "towards": study.directions,

@@ -10,6 +10,7 @@ import numpy as np
 
 from dvc import engine_named
 from dvc.errors import InputError, MrstrainError
+from dvc.file_names import clash
 from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.threads import usable_cores
@@ -129,14 +130,12 @@ def _finished(folder: Path) -> dict[str, ErrorSamples]:
 
 def _refuse_one_name_for_two(cases: Sequence[AccuracyCase]) -> None:
     """Refuse parameter files that share a name: runs and error models are stored under it."""
-    named: dict[str, str] = {}
-    for case in cases:
-        other = named.setdefault(Path(case.preset).stem, case.preset)
-        if other != case.preset:
-            raise InputError(
-                f"{other} and {case.preset} would have the same name '{Path(other).stem}' in this study. Rename one, "
-                "or use another folder (out)."
-            )
+    presets = dict.fromkeys(case.preset for case in cases)
+    if twice := clash(Path(preset).stem for preset in presets):
+        raise InputError(
+            f"Two of the parameter files {', '.join(presets)} would have one name in this study, {twice}. Rename one, "
+            "or use another folder (out)."
+        )
 
 
 def _check(case: AccuracyCase) -> None:

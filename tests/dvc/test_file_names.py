@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 import fe
 from dvc.errors import InputError
-from dvc.file_names import as_file_name
+from dvc.file_names import as_file_name, clash
+from mrstrain import register
+from mrstrain.comparison.model_files import model_files
+from mrstrain.models.simulate import material_sets
+from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import case_names
 from mrstrain.studies.file import read_study
+from mrstrain.studies.plan import plan
 from validate.tables import RECORD, remove_earlier
 
 OUTSIDE = ("../x", "..", ".", "a/b", "/x", "C:x", "a\\b", "\\\\host\\x", "~/x/", "x\0y", "x\ny", "x\x1b[2J", "x\u202ey")
@@ -61,3 +68,54 @@ def test_a_comparison_removes_no_folder_that_its_record_names_elsewhere(tmp_path
     record.write_text('{"coverage_ml": {"Load1": 1.0}}')
     remove_earlier(tmp_path / "out", [])
     assert not (tmp_path / "out" / "Load1").exists()
+
+
+@pytest.mark.parametrize(("one", "other"), [("Load1", "load1"), ("Straße", "STRASSE"), ("Füße", "Fu\u0308ße")])
+def test_names_that_a_file_system_takes_for_one_are_refused_wherever_they_are_given(
+    tmp_path: Path, one: str, other: str
+) -> None:
+    """Some file systems ignore case, or how an accent is stored: there, the second overwrites the first."""
+    assert clash([one, other, "x"]) == f"'{one}' and '{other}' (case is ignored)"
+    assert clash([one, "x"]) == ""
+    assert clash([one, "x", one]) == f"'{one}'"
+    both = re.escape(f"'{one}' and '{other}'")
+    with pytest.raises(InputError, match=both):
+        fe.paths_of([fe.LoadStep(one, normal_n=1.0), fe.LoadStep(other, normal_n=2.0)])
+    with pytest.raises(InputError, match=both):
+        case_names([Path("in") / f"{one}.nii.gz", Path("again") / f"{other}.nrrd"])
+    with pytest.raises(InputError, match=rf"study\.toml: two loads .* {both}"):
+        read_study(_study(tmp_path, loads=(one, other)))
+    files = [tmp_path / f"{number}.toml" for number in range(2)]
+    for file, name in zip(files, (one, other), strict=True):
+        file.write_text(fe.as_toml(name, "", {"fat": fe.NeoHooke.of(mu_mpa=0.01, nu=0.49)}), encoding="utf-8")
+    with pytest.raises(InputError, match=both):
+        material_sets([str(file) for file in files])
+    names = [file.name for file in files]
+    with pytest.raises(InputError, match=rf"two material sets .* {both}"):
+        plan(read_study(_study(tmp_path, sets=names)))
+    for place in (one, f"again/{other}"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "Load1.vtu").touch()
+    with pytest.raises(InputError, match=rf"[Tt]wo models .* {both}"):
+        model_files(["Load1"], [tmp_path / one, tmp_path / "again" / other], ModelReading())
+    with pytest.raises(InputError, match=rf"another model are named {both}"):
+        plan(read_study(_study(tmp_path, results=[one, f"again/{other}"])))
+    with pytest.raises(InputError, match=rf"another model are named {both}"):
+        plan(read_study(_study(tmp_path, sets=names[:1], results=[f"again/{other}"])))
+
+
+def test_a_load_is_not_called_as_the_repeat_scan_is(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'repeat' is reserved for the repeat scan"):
+        read_study(_study(tmp_path, loads=("Repeat",)))
+    with pytest.raises(InputError, match="'repeat', which is reserved for the repeat scan"):
+        register("a.nii", ["REPEAT.nii"], out=tmp_path / "out", repeat="b.nii", align="image")
+    assert not (tmp_path / "out").exists()
+
+
+def _study(
+    folder: Path, loads: Sequence[str] = ("Load1",), sets: Sequence[str] = (), results: Sequence[str] = ()
+) -> Path:
+    text = '[study]\nname = "a"\n[images]\nload0 = "a.nii"\nlabels = "b.nii"\n'
+    text += "".join(f'[loads."{name}"]\nimage = "{at}.nii"\nnormal_n = 1.0\n' for at, name in enumerate(loads))
+    (folder / "study.toml").write_text(f"{text}[models]\nsets = {[*sets]}\nresults = {[*results]}\n", encoding="utf-8")
+    return folder

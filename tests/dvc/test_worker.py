@@ -7,6 +7,8 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import psutil
@@ -15,6 +17,16 @@ import pytest
 import dvc  # whose functions load when they are asked for: the processes of these tests import this file
 from dvc.errors import RegistrationError, WorkerError
 from dvc.worker import Worker, each_in_workers, side_by_side
+from tests.processes import is_gone, wait_for
+
+LONG_S, AT_ONCE_S = 60.0, 50.0
+"""How long a task sleeps, and the most that its end may take: to start a process takes long on a busy machine."""
+
+
+def soon(act: Callable[[], None]) -> Callable[[], None]:
+    """Something that another thread does once, as the task runs and is waited for; to be given as ``watch``."""
+    later = threading.Timer(0.1, act)
+    return lambda: None if later.ident else later.start()
 
 
 def _crash() -> None:
@@ -128,10 +140,9 @@ def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():
     worker = Worker(threads=1)
     worker.run("asking", _process)
     began = time.monotonic()
-    threading.Timer(0.5, worker.kill).start()
     with pytest.raises(WorkerError, match="sleeping"):
-        worker.run("sleeping", time.sleep, 60.0)
-    assert time.monotonic() - began < 20.0
+        worker.run("sleeping", time.sleep, LONG_S, watch=soon(worker.kill))
+    assert time.monotonic() - began < AT_ONCE_S
     worker.close()
 
 
@@ -141,13 +152,12 @@ def test_an_interrupt_leaves_no_process_and_the_next_task_has_a_fresh_one(monkey
     try:
         with Worker(threads=1) as worker:
             first, _ = worker.run("asking", _process)
-            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
             with pytest.raises(KeyboardInterrupt):
-                worker.run("sleeping", time.sleep, 60.0)
+                worker.run("sleeping", time.sleep, LONG_S, watch=soon(lambda: os.kill(os.getpid(), signal.SIGINT)))
             began = time.monotonic()
             assert worker.run("asking", _process)[0] != first
-            assert time.monotonic() - began < 20.0
-            assert not psutil.pid_exists(first)
+            assert time.monotonic() - began < AT_ONCE_S
+            wait_for(lambda: is_gone(first))
     finally:
         signal.signal(signal.SIGINT, usual)
 
@@ -157,7 +167,11 @@ def test_an_interrupted_registration_leaves_no_process_and_the_next_begins(tiny_
         raise KeyboardInterrupt
 
     def workers() -> set[int]:
-        return {one.pid for one in psutil.Process().children() if "popen_loky" in " ".join(one.cmdline())}
+        found = set[int]()
+        for one in psutil.Process().children():
+            with suppress(psutil.Error):  # it has just ended
+                found |= {one.pid} if "popen_loky" in " ".join(one.cmdline()) else set()
+        return found
 
     before = workers()
     for _ in range(2):
@@ -165,7 +179,7 @@ def test_an_interrupted_registration_leaves_no_process_and_the_next_begins(tiny_
             dvc.register(
                 tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.labels.region("bone"), progress=interrupt
             )
-        assert workers() <= before
+        wait_for(lambda: workers() <= before)
 
 
 def test_a_worker_that_is_killed_while_its_process_starts_runs_no_task():
@@ -174,9 +188,9 @@ def test_a_worker_that_is_killed_while_its_process_starts_runs_no_task():
     running = worker._running
     worker._running = lambda: (running(), worker.kill())[0]  # type: ignore[method-assign]
     with pytest.raises(WorkerError, match="sleeping"):
-        worker.run("sleeping", time.sleep, 60.0)
+        worker.run("sleeping", time.sleep, LONG_S)
     worker.close()
-    assert time.monotonic() - began < 20.0
+    assert time.monotonic() - began < AT_ONCE_S
     with pytest.raises(WorkerError, match="ended before its task began"):
         Worker.run(worker, "asking", _process)
 

@@ -1,6 +1,7 @@
 """A simulation that was cut goes on: the same end as of one that was not, and nothing is solved twice."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -168,15 +169,9 @@ def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) ->
         assert read_checkpoint(place, made_from()) is None
 
 
-@pytest.mark.usefixtures("in_this_process")
-def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
-    write_tet_mesh(tmp_path / "dome.vtu", dome((4, 6, 6)), {})
-    command = ["simulate", str(tmp_path / "dome.vtu"), *GIVEN]
-    uncut = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "uncut")])
-    assert uncut.exit_code == 0, uncut.output
-    out = tmp_path / "cut" / "luboz"
+def killed_after_the_first_load(command: list[str], out: Path) -> None:
     started = subprocess.Popen(
-        [sys.executable, "-m", "mrstrain", *command, "--out", str(out.parent)],
+        [sys.executable, "-m", "mrstrain", *command],
         start_new_session=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -188,6 +183,20 @@ def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
     finally:
         os.killpg(started.pid, signal.SIGKILL)
         started.wait()
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((4, 6, 6)), {})
+    command = ["simulate", str(tmp_path / "dome.vtu"), *GIVEN]
+    uncut = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "uncut")])
+    assert uncut.exit_code == 0, uncut.output
+    out = tmp_path / "cut" / "luboz"
+    for _ in range(5):
+        killed_after_the_first_load([*command, "--out", str(out.parent)], out)
+        if not (out / "c.restart.npz").exists():
+            break
+        shutil.rmtree(out.parent)  # on a busy machine it was seen late
     assert not (out / "simulation.json").exists()
     assert not (out / "c.restart.npz").exists()
     so_far = (out / "log-a.txt").read_text().splitlines()

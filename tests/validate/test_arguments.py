@@ -60,8 +60,13 @@ def test_two_models_and_two_loads_have_names_of_their_own() -> None:
     twice = validate.LoadCase.of("Load1", sheared(0.4), [MODEL, other])
     with pytest.raises(MrstrainError, match="Load1: two models are named 'a'"):
         validate.compare([twice], labels())
-    with pytest.raises(MrstrainError, match="Loads must have different names; got Load1, Load1"):
+    with pytest.raises(MrstrainError, match="Two loads are named 'Load1'"):
         validate.compare([CASE, CASE], labels())
+    alike = validate.LoadCase.of("Load1", sheared(0.4), [MODEL, replace(MODEL, name="A")])
+    with pytest.raises(MrstrainError, match="Load1: two models are named 'a' and 'A'"):
+        validate.compare([alike], labels())
+    with pytest.raises(MrstrainError, match="Two loads are named 'Load1' and 'load1'"):
+        validate.compare([CASE, replace(CASE, load="load1")], labels())
     with pytest.raises(MrstrainError, match="two models are named 'no deformation'"):
         validate.compare_load(
             validate.LoadCase.of("a", sheared(0.4), [replace(MODEL, name="no deformation")]), labels()

@@ -108,7 +108,8 @@ def read_names(path: StrPath) -> dict[int, str]:
     if is_csv := place.suffix.lower() == ".csv":
         lines, rows = [], _csv_names(*read_table(place))
     else:
-        lines = [line.strip() for line in read_text(place).splitlines() if line.strip() and not line.startswith("#")]
+        stripped = (line.strip() for line in read_text(place).splitlines())
+        lines = [line for line in stripped if line and not line.startswith("#")]
         rows = [_table_name(line) for line in lines]
     if not rows or None in rows:
         wrong = "" if is_csv or not rows else f" (line: {lines[rows.index(None)][:60]!r})"

@@ -32,7 +32,8 @@ def read_frd(path: Path) -> RawMesh:
     """Read a result file: its regions are the materials ("material 1"), its field the last step's displacement.
 
     CalculiX expands shells, membranes and beams to solids. They are left out if the deck lies beside the result, with
-    its name; without the deck, what has the node numbers of a shell is told. Both are logged.
+    its name, and lists them; of elements that it does not list, those with node numbers of a shell are told. Both are
+    logged.
     """
     try:
         text = path.read_text(encoding="ascii")
@@ -52,7 +53,7 @@ def read_frd(path: Path) -> RawMesh:
                     mesh.add_node(int(row[3:13]), _values(row))
             elif line.startswith("    3C"):
                 rows = _counted(line, _rows(path, lines, "elements"))
-                _add_elements(rows, mesh, materials, _no_solids(path.with_suffix(".inp")))
+                _add_elements(rows, mesh, materials, *_solids_and_others(path.with_suffix(".inp")))
             elif line.startswith(" -4  DISP"):
                 rows = [row for row in _rows(path, lines, "displacements") if row.startswith(" -1")]
                 at_nodes = {"displacement": {int(row[3:13]): _values(row) for row in rows}}
@@ -102,7 +103,7 @@ def _values(row: str) -> list[float]:
 
 
 def _add_elements(
-    rows: list[str], mesh: NumberedMesh, materials: dict[str, list[int]], no_solids: set[int] | None
+    rows: list[str], mesh: NumberedMesh, materials: dict[str, list[int]], solids: set[int], others: set[int]
 ) -> None:
     left_out = alike = 0
     starts = [n for n, row in enumerate(rows) if row.startswith(" -1")]
@@ -112,18 +113,18 @@ def _add_elements(
         nodes = [int(row[i : i + _NODE]) for row in rows[start + 1 : end] for i in range(3, len(row.rstrip()), _NODE)]
         order = _ORDER.get(shape, range(len(nodes)))
         nodes = [nodes[i] for i in order] if len(order) == len(nodes) else nodes
-        if shape in _LAYERS and number in (no_solids or ()):
+        if shape in _LAYERS and number in others:
             left_out += 1
             continue
-        alike += no_solids is None and _like_a_shell(shape, nodes, mesh)
+        alike += number not in solids and _like_a_shell(shape, nodes, mesh)
         mesh.add_element(number, shape, nodes)
         materials.setdefault(f"material {int(head[23:28])}", []).append(number)
     if left_out:
         _log.info("%s: %d shells, membranes or beams, expanded to solids, are left out.", mesh.path, left_out)
     if alike:
         _log.warning(
-            "%s: %d elements may be shells that CalculiX expanded to solids, and count as tissue. Put the deck (%s) "
-            "beside the result, or write it with OUTPUT=2D.",
+            "%s: %d elements may be shells that CalculiX expanded to solids, and count as tissue. Put the deck (%s), "
+            "with these elements in it, beside the result, or write it with OUTPUT=2D.",
             mesh.path, alike, mesh.path.with_suffix(".inp").name,
         )  # fmt: skip
 
@@ -135,13 +136,14 @@ def _like_a_shell(shape: str, nodes: list[int], mesh: NumberedMesh) -> bool:
     return bool(pairs) and all(above == below + 2 and below + 1 not in mesh.nodes for below, above in pairs)
 
 
-def _no_solids(deck: Path) -> set[int] | None:
-    """Numbers of the elements of a deck that are no solids; None without a deck."""
-    if not deck.is_file():
-        return None
+def _solids_and_others(deck: Path) -> tuple[set[int], set[int]]:
+    """Numbers of the solids that a deck lists, and of its other elements; none without a deck.
+
+    A deck may have its elements, or some, in files that it includes.
+    """
     solids, others = set[int](), set[int]()
-    for keyword in keywords(deck):
+    for keyword in keywords(deck) if deck.is_file() else ():
         if keyword.name == "ELEMENT":
             of = solids if keyword.options.get("TYPE", "").upper().startswith("C3D") else others
             of.update(int(row[0]) for row in keyword.rows if row[0].isdecimal())
-    return others - solids
+    return solids, others - solids

@@ -149,7 +149,7 @@ def _refuse_other_length(path: Path) -> None:
 
 
 def _read_in_a_worker(path: Path) -> Deformation:
-    over = time.monotonic() + _MOST_S + path.stat().st_size / _BYTES_PER_S
+    over = np.inf
 
     def watch() -> None:
         if time.monotonic() > over:
@@ -157,6 +157,9 @@ def _read_in_a_worker(path: Path) -> Deformation:
 
     with Worker(threads=1) as worker:
         try:
+            worker.start(__name__)
+            worker.run(f"reading {path.name}", int)  # the time counts once the process is there
+            over = time.monotonic() + _MOST_S + path.stat().st_size / _BYTES_PER_S
             return worker.run(f"reading {path.name}", _read, path, watch=watch)
         except WorkerError as died:
             raise InputError(

@@ -9,6 +9,7 @@ import sys
 import zlib
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -53,6 +54,16 @@ def test_a_pdf_holds_its_truetype_font_once_and_no_date(tmp_path: Path) -> None:
     assert b"+mrstrainSans" in pdf
     assert not re.search(rb"CreationDate|ModDate|/Producer|matplotlib", pdf)
     assert rcParams["pdf.fonttype"] == 3  # as it was for everybody else
+
+
+def test_a_legend_that_takes_long_on_a_busy_machine_warns_of_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """matplotlib warns of a place that it chose for longer than a second, unless it was told to choose."""
+    times = iter(range(0, 1000, 60))
+    monkeypatch.setattr("matplotlib.legend.time", SimpleNamespace(perf_counter=lambda: float(next(times))))
+    save_figure(tmp_path / "curve", curve())
+    assert next(times) > 60  # it was asked for the time
 
 
 def test_letters_that_the_font_lacks_come_from_another(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from dvc.images.image import Grid, LabelMap
 from dvc.report.drawing import png_bytes
 from dvc.report.figures import shear_curves
 from dvc.report.page import Picture, Section, Table, Viewer, Volume, shown, write_report
-from dvc.trust.verdict import Verdict
+from dvc.trust.verdict import Verdict, worst
 
 pytestmark = pytest.mark.usefixtures("real_pictures")
 
@@ -85,7 +85,7 @@ def test_names_are_escaped_everywhere(html: str) -> None:
     assert page.all("script") == [{}]  # the page's own
     assert len(page.all("img")) == 1
     assert not any(key.startswith("on") for _, attributes in page.tags for key in attributes)
-    places = 15  # each place above, of which the title, the section's title and its reason are told more than once
+    places = 15  # each place above, of which the title and the section's title are told more than once
     assert "".join(page.text).count(ATTACK) >= places
 
 
@@ -145,6 +145,18 @@ def test_a_verdict_without_reasons_says_once_what_it_means(tmp_path: Path) -> No
     page = (tmp_path / "r.html").read_text()
     assert page.count('class="verdict trust"') == page.count("No check speaks against the measurement") == 1
     assert page.count('<span class="pill trust">Trust</span>') == 1
+
+
+def test_reasons_of_the_only_load_are_told_once_and_of_several_loads_with_each(tmp_path: Path) -> None:
+    def page(*sections: Section) -> str:
+        write_report(tmp_path / "r.html", "A heel", worst(s.verdict for s in sections if s.verdict), sections, (), {})
+        return (tmp_path / "r.html").read_text()
+
+    doubtful = Verdict("caution", ("Slices are 4 mm apart.",))
+    alone = page(Section("Load1", doubtful))
+    assert alone.count("Slices are 4 mm apart.") == alone.count('<span class="pill caution">') == 1
+    both = page(Section("Load1", doubtful), Section("Load2", Verdict("distrust", ("Fat folds.",))))
+    assert both.count("Slices are 4 mm apart.") == 1
 
 
 def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from dvc.trust.error_model import (
     ErrorModel,
     ErrorTable,
     GaussianField,
+    TruthDraws,
     figures_of,
     read_error_model,
     to_surface_mm,
@@ -150,6 +152,29 @@ def test_intervals_are_widened_from_their_middle_and_stay_possible() -> None:
     assert all(i.low >= 0.0 for i in wide)
     volume = everywhere.size * GRID.voxel_volume_mm3 / 1000.0
     assert all(i.high <= volume for i in wide if i.figure.startswith("volume"))
+
+
+def test_no_more_than_a_few_truths_are_in_memory_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures may take longer than a draw, and two hundred truths of a whole foot take half a gigabyte."""
+    drawn, used, waiting = TruthDraws.drawn, list[None](), list[int]()
+
+    def counted(draws: TruthDraws) -> np.ndarray:
+        waiting.append(1 + len(waiting) - len(used))
+        return drawn(draws)
+
+    def slow(shear: np.ndarray, volume_ml: float) -> np.ndarray:
+        time.sleep(0.003)
+        used.append(None)
+        return figures_of(shear, volume_ml)
+
+    monkeypatch.setattr(TruthDraws, "drawn", counted)
+    monkeypatch.setattr("dvc.trust.error_model.figures_of", slow)
+    fat = np.zeros(GRID.shape, dtype=bool)
+    fat[4:7, 4:7, 4:7] = True
+    shear, far = np.full(GRID.shape, 0.2, dtype=np.float32), np.full(GRID.shape, 9.0, dtype=np.float32)
+    uncertainty_of(shear, GRID, {"fat": fat}, far, TABLE)
+    assert len(waiting) > 100
+    assert max(waiting) <= 3
 
 
 def test_intervals_cover_the_truth_as_often_as_they_claim() -> None:

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import re
 
+import pytest
+import typer
 from typer.testing import CliRunner
 
 from mrstrain.cli.app import app
+from mrstrain.cli.options import EXAMPLES
+
+COMMANDS = typer.main.get_command(app).commands
+HELP = {name: CliRunner().invoke(app, [name, "--help"], terminal_width=100).output for name in COMMANDS}
 
 
 def test_without_arguments_it_greets_with_three_commands_and_not_with_the_whole_help() -> None:
@@ -22,3 +28,35 @@ def test_a_command_does_not_greet_and_one_that_there_is_not_is_refused() -> None
     assert CliRunner().invoke(app, ["--version"]).output.startswith("mrstrain 0")
     assert "mrstrain demo" not in CliRunner().invoke(app, ["fit", "--help"]).output
     assert CliRunner().invoke(app, ["registr"]).exit_code == 2
+
+
+@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"doctor"}))  # which takes nothing
+def test_each_help_ends_with_an_example_that_can_be_pasted(name: str) -> None:
+    program, command, *given = HELP[name].splitlines()[-1].split()
+    assert (program, command) == ("mrstrain", name)
+    COMMANDS[name].make_context(name, given)  # refuses what it does not know
+
+
+def test_an_example_with_an_option_that_is_not_there_is_found() -> None:
+    with pytest.raises(Exception, match="--bones"):
+        COMMANDS["register"].make_context("register", ["Load0.nii.gz", "Load1.nii.gz", "--bones", "calcaneus.nii.gz"])
+    assert set(EXAMPLES) == set(COMMANDS) - {"doctor"}
+
+
+def test_the_list_of_commands_ends_no_sentence_early() -> None:
+    listed = CliRunner().invoke(app, ["--help"]).output.partition("Commands:")[2]
+    assert "..." not in listed
+    assert listed.count(".\n") >= len(COMMANDS)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_a_help_says_each_default_once_and_kinds_in_plain_words(name: str) -> None:
+    told = " ".join(HELP[name].split())
+    for option in re.split(r" (?=--[a-z])", told):
+        assert option.count("Default: ") + option.count("[default: ") <= 1, option
+    assert not re.search(r"<list|range>|<str|<int|<float|>\.\.\.", told)
+
+
+def test_a_simulation_says_nothing_of_elastix() -> None:
+    assert "elastix" not in HELP["simulate"]
+    assert "elastix reproduces" in " ".join(HELP["register"].split())

@@ -27,9 +27,12 @@ ROLES = {"load0": "Load0.nii.gz", "labels": "tissues.nii.gz", "names": "tissues.
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """A subject's folder, in another: files are looked for beside it too, where those of other tests would be found."""
+    place = tmp_path / "subject"
+    place.mkdir()
     for name in ROLES.values():
-        (tmp_path / name).write_text(name)
-    return tmp_path
+        (place / name).write_text(name)
+    return place
 
 
 def measured(folder: Path, *roles: str, load: str = "Load1", **parameters: object) -> ResultFolder:

@@ -45,3 +45,12 @@ def test_a_run_that_ended_early_is_left_out_and_told(tmp_path: Path, failed: str
 def test_where_no_run_ended_nothing_is_compared(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="ERROR TERMINATION"):
         model_files(LOADS, [model(tmp_path / "mine", Load1="febio/fails")], ModelReading())
+
+
+def test_of_two_results_of_one_load_it_is_said_which_is_compared(tmp_path: Path) -> None:
+    place = model(tmp_path / "mine", Load1="febio/hex8", Load2="febio/hex8")
+    (place / "Load1.vtu").write_text("")  # as `simulate --decks` leaves it, where FEBio then runs the deck
+    files, notes = model_files(LOADS, [place], ModelReading())
+    assert [files[load][0].path.name for load in LOADS] == ["Load1.vtu", "Load2.xplt"]
+    (note,) = notes
+    assert note == "mine: Load1.vtu is compared, Load1.xplt is not. To compare it, move it to another folder."

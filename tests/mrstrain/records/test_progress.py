@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import re
-import time
 
 import pytest
 from rich.console import Console
 
 from mrstrain.records import progress
+from tests.processes import wait_for
 
 
 @pytest.fixture
@@ -32,6 +32,22 @@ def test_lines_come_now_and_then_with_the_time_left(clock: list[float], capsys: 
         "Load1: registering 25 % after 20 s, 60 s left",
         "Load1: registering 60 % after 36 s, 24 s left",
         "Load1: registering 100 % after 60 s",
+    ]
+
+
+def test_what_takes_longer_than_expected_is_never_called_done(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress.live() as told:
+        for second, fraction in ((0, 0.0), (20, 0.98), (40, 0.999), (200, 0.9999), (300, 1.0)):
+            clock[0] = 1000.0 + second
+            told("mesh", "meshing", fraction)
+    assert capsys.readouterr().err.splitlines() == [
+        "mesh: meshing 0 % after 0 s",
+        "mesh: meshing 98 % after 20 s",
+        "mesh: meshing 99 % after 40 s",
+        "mesh: meshing 99 % after 200 s, 2 s left",
+        "mesh: meshing 100 % after 300 s",
     ]
 
 
@@ -104,7 +120,7 @@ def test_thirty_ended_stages_do_not_push_the_running_one_off_the_screen() -> Non
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=100, height=24)
     with progress.live(of_all=True, console=console) as told:
-        time.sleep(0.3)
+        wait_for(lambda: screen(file.getvalue(), 24) != [])  # drawn ten times a second, by a thread
         begun = screen(file.getvalue(), 24)
         assert len(begun) == 1
         assert begun[0].startswith("all")
@@ -113,7 +129,7 @@ def test_thirty_ended_stages_do_not_push_the_running_one_off_the_screen() -> Non
             told(f"simulate set-{number}", f"plate displacement [{number}] mm", 1.0)
             told("all", "40 stages", (number + 1) / 40)
         told("register Load4", "registering", 0.25)
-        time.sleep(0.5)  # drawn ten times a second
+        wait_for(lambda: "25 %" in screen(file.getvalue(), 24)[-1])
         shown = screen(file.getvalue(), 24)
     assert [line.split("%")[0].split()[0] for line in shown] == ["all:", "register"]
     assert "75 %" in shown[0]

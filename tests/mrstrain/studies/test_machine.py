@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
-import psutil
 import pytest
 from filelock import FileLock
 
@@ -30,7 +29,7 @@ from mrstrain.studies.run import _log
 from mrstrain.studies.stages import StageResult
 from tests.mrstrain.studies import test_pipeline
 from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
-from tests.processes import wait_for
+from tests.processes import is_gone, wait_for
 
 if sys.platform != "win32":
     import resource
@@ -211,7 +210,7 @@ def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, 
         assert name == "next"
         assert "has no attribute 'no_stage'" in outcome
         assert worker not in runner._client.nthreads()
-        wait_for(lambda: not psutil.pid_exists(below), limit_s=30.0)
+        wait_for(lambda: is_gone(below))
         assert not runner.busy
 
 

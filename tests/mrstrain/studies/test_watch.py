@@ -61,7 +61,7 @@ class Seen:
 
     def page_with(self, *words: str) -> str:
         """The page, as soon as it has these words."""
-        wait_for(lambda: self.path.is_file() and all(word in self.path.read_text() for word in words), limit_s=20.0)
+        wait_for(lambda: self.path.is_file() and all(word in self.path.read_text() for word in words))
         return self.path.read_text()
 
 
@@ -97,7 +97,7 @@ def test_the_report_grows_while_the_study_runs(seen: Seen) -> None:
         assert '<meta http-equiv="refresh" content="10">' in page
         seen.end("register Load2", "The bone was not found.")
         assert states(seen.page_with("bone was not"))["register Load2"] == ("FAILED", "FAILED. The bone was not found.")
-    wait_for(lambda: seen.shown == [seen.path], limit_s=20.0)
+    wait_for(lambda: seen.shown == [seen.path])
     for name in ("mesh", "simulate trebbi", "compare"):
         seen.end(name, StageResult(()))
     seen.watch.reports[""].whole()
@@ -170,6 +170,6 @@ def test_a_run_whose_stages_hang_tells_how_long_it_has_been(seen: Seen) -> None:
     seen.watch.told("mesh", "meshing", 0.5)
     told = len(seen.events)
     with seen.watch.reporting():
-        wait_for(lambda: len(seen.events) > told + 2, limit_s=20.0)
+        wait_for(lambda: len(seen.events) > told + 2)
     assert {case for case, *_ in seen.events[told:]} == {ALL}
     assert all(0.0 <= fraction < 1.0 for *_, fraction in seen.events[told:])

@@ -179,7 +179,7 @@ class TestNames:
             ),
             (
                 "a.ctbl",
-                "# Color table file\n0 Background 0 0 0 0\n1 fat 255 0 0 255\n4 muscle belly 0 255 0 255\n",
+                "# Color\n  # of a person\n0 Background 0 0 0 0\n1 fat 255 0 0 255\n4 muscle belly 0 255 0 255\n",
             ),
         ],
     )

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.io.transforms.read import read_transform
 from dvc.io.transforms.write import write_itk_transform
+from dvc.worker import Worker
 
 OBLIQUE = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 PERMUTED = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -204,3 +206,19 @@ def test_a_file_that_harms_its_reader_is_refused(
     monkeypatch.setattr("dvc.io.transforms.itk_file._read", reader)
     with pytest.raises(InputError, match=rf"map\.h5: .*{message}"):
         read_transform(path)
+
+
+def test_a_process_that_takes_long_to_start_is_no_fault_of_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a machine that swaps its memory to disk: the time limit is that of reading."""
+    path, now, running = damaged(tmp_path / "map.h5", bytes), [0.0], Worker._running
+
+    def slow(worker: Worker) -> object:
+        now[0] += 100.0 if worker._executor is None else 0.0
+        return running(worker)
+
+    monkeypatch.setattr(Worker, "_running", slow)
+    monkeypatch.setattr("dvc.io.transforms.itk_file.time", SimpleNamespace(monotonic=lambda: now[0]))
+    assert isinstance(read_transform(path), Composed)
+    assert now == [100.0]
