@@ -54,7 +54,9 @@ def two_levels(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -
     return Levels(float(np.median(blurred[~bright])), float(np.median(blurred[bright])), middle)
 
 
-def brighter_share(values: Float32Array, where: BoolArray, levels: Levels, spacing_mm: FloatArray) -> FloatArray:
+def brighter_share(
+    values: Float32Array, where: BoolArray, levels: Levels, spacing_mm: FloatArray, border_mm: float = _BORDER_MM
+) -> FloatArray:
     """Probability of the brighter of two tissues, (ni, nj, nk); a half outside ``where``.
 
     Divided at a half, this is the division with the least sum of voxels on the wrong side of the middle, each counted
@@ -62,6 +64,6 @@ def brighter_share(values: Float32Array, where: BoolArray, levels: Levels, spaci
     Borders count by voxels, in all directions alike.
     """
     told = np.where(where, np.clip((values - levels.middle) / (levels.brighter - levels.darker), -1.0, 1.0), 0.0)
-    weight = _BORDER_MM / float(spacing_mm.mean())
+    weight = border_mm / float(spacing_mm.mean())
     smooth = denoise_tv_chambolle(told, weight=weight, max_num_iter=_ITERATIONS, eps=_CONVERGED)
     return np.asarray(ndtr(smooth / _SPREAD))

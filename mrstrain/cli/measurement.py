@@ -9,7 +9,15 @@ import typer
 import mrstrain
 from mrstrain.cli.lines import say
 from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
-from mrstrain.options.measurement import BoneAndBody, MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
+from mrstrain.options.measurement import (
+    BoneAndBody,
+    Marks,
+    MeshAndAxes,
+    RegistrationOptions,
+    Running,
+    Scans,
+    SubjectFiles,
+)
 from mrstrain.options.modelling import HeelShape
 
 SliceSpacing = Annotated[
@@ -21,12 +29,15 @@ SliceSpacing = Annotated[
 def label(
     load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, enhanced DICOM, or a DICOM folder.")],
     out: Annotated[Path, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.")], masks: BoneAndBody,
+    strokes: Marks,
 ) -> None:  # fmt: skip
-    """Make a label map of skin, fat, muscle and other bones from the unloaded image and a mask of its bone."""
+    """Make a label map of skin, fat, muscle and bones from the unloaded image and its bone, or a few marks."""
     from mrstrain.records.progress import live
 
     with live() as progress:
-        done = mrstrain.label.with_options(load0, out=out, masks=masks, watch=partial(progress, "label", "tissues"))
+        done = mrstrain.label.with_options(
+            load0, out=out, masks=masks, strokes=strokes, watch=partial(progress, "label", "tissues")
+        )
     tell(done)
 
 

@@ -2,28 +2,33 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from dvc import label_tissues, read_image, read_mask, write_labels, write_vectors
+from dvc import LabelMap, label_tissues, read_image, read_labels, read_mask, write_labels, write_vectors
+from dvc.arrays import FloatArray
 from dvc.atomic_files import write_json
 from dvc.errors import InputError, OutputError
+from dvc.measurement.subject import is_bones_name
 from dvc.report.drawing import ENDINGS, save_figure
 from dvc.report.labels import label_slices
 from dvc.report.sheet import View
 from mrstrain.options.door import door
-from mrstrain.options.measurement import BoneAndBody
+from mrstrain.options.measurement import BoneAndBody, Marks
 from mrstrain.records.inputs import image_stem, output_folder
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.provenance import provenance
 
 _WRITTEN = (".nii.gz", ".nii", ".nrrd", ".mha")
+_USUAL = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon"}  # marks without names
 
 
 @door
 def label(
-    load0: Path | str, *, out: Path | str, masks: BoneAndBody, watch: Callable[[float], None] | None = None
+    load0: Path | str, *, out: Path | str, masks: BoneAndBody, strokes: Marks,
+    watch: Callable[[float], None] | None = None,
 ) -> Outcome:  # fmt: skip
     """Label skin, fat, muscle and other bones of an unloaded image.
 
@@ -34,37 +39,35 @@ def label(
     out : path
         The label map. Beside it are written the names (.csv), the probability of each tissue (STEM_probability), a
         picture (.png, .pdf), and a record (.json).
-    masks
-        The bone is required.
+    masks, strokes
+        The bone, or the mark of one, is required; as in `dvc.label_tissues`.
     watch
         As in `dvc.label_tissues`.
 
     Raises
     ------
     InputError, OutputError
-        Before anything is written: if no bone is given, a file cannot be read or does not fit, or an input would be
-        overwritten.
+        Before anything is written: if no bone is given or marked, a file cannot be read or does not fit, or an input
+        would be overwritten.
     """
     target, source = Path(out), Path(load0)
     ending = next((one for one in _WRITTEN if target.name.lower().endswith(one)), None)
     if ending is None:
         raise InputError(f"The output (out) is the label map and must end in {', '.join(_WRITTEN)}; got {target}.")
-    if masks.bone is None:
-        raise InputError(
-            "label needs the mask of a bone (bone). Paint it in 3D Slicer or ITK-SNAP, and save it as NIfTI or NRRD."
-        )
     stem = target.with_name(image_stem(target.name))
     beside = [stem.with_name(stem.name + one) for one in (".csv", ".json", "_probability.json", *ENDINGS)]
     probabilities = stem.with_name(f"{stem.name}_probability{ending}")
-    for path in (source, *masks.paths):
+    for path in (source, *masks.paths, *strokes.paths):
         if path.resolve() in [one.resolve() for one in (target, probabilities, *beside)]:
             raise OutputError(f"{path} is an input and would be overwritten. Choose another output file (out).")
     began, image = time.perf_counter(), read_image(source)
-    bone = read_mask(masks.bone, image.grid)
-    body = None if masks.tissue is None else read_mask(masks.tissue, image.grid)
-    made = label_tissues(image, bone, body, watch or (lambda _: None))
+    bone, body = (None if one is None else read_mask(one, image.grid) for one in (masks.bone, masks.tissue))
+    marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
+    made = label_tissues(image, bone, body, marks, watch or (lambda _: None))
     names = tuple(made.labels.names.values())
-    record = provenance("label", {"load0": source, **{role: of[0] for role, of in masks.files.items()}}, {})
+    record = provenance(
+        "label", {"load0": source, **{role: of[0] for role, of in (masks.files | strokes.files).items()}}, {}
+    )
     found = {"unsure": made.unsure, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
     with output_folder(target.parent):
         write_labels(target, made.labels)
@@ -72,7 +75,7 @@ def label(
             probabilities, image.grid, np.moveaxis(made.probability, 0, -1), names, "probability of each tissue",
             frame="invariant", unit="1",
         )  # fmt: skip
-        view = View.through(image.grid, bone.points()[np.argmin(bone.points()[:, 2])], made.labels.labels > 0)
+        view = View.through(image.grid, _shown(made.labels), made.labels.labels > 0)
         save_figure(stem, label_slices(view, image, made.labels, made.probability))
         write_json(beside[1], record | found)
     voxel_ml = image.grid.voxel_volume_mm3 / 1000.0
@@ -87,3 +90,27 @@ def label(
         f"Label map: {target}",
     )
     return Outcome(target, lines)
+
+
+def read_marks(path: Path, names: Path | None) -> LabelMap:
+    """Marks with the names of a table, of the file itself, or the usual ones of their numbers."""
+    marks = read_labels(path, names)
+    if names is None and all(name == f"label-{number}" for number, name in marks.names.items()):
+        if unknown := [number for number in marks.names if number not in _USUAL]:
+            usual = ", ".join(f"{number} {name}" for number, name in _USUAL.items())
+            raise InputError(
+                f"{path}: the marks {unknown} have no name. Give a table of names (mark_names), or use the usual "
+                f"numbers: {usual}."
+            )
+        return replace(marks, names={number: _USUAL[number] for number in marks.names})
+    return marks
+
+
+def _shown(labels: LabelMap) -> FloatArray:
+    """The lowest point of the first bone, LPS mm; the middle of the body without one."""
+    bones = [name for name in labels.names.values() if is_bones_name(name)]
+    points = labels.region(bones[0]).points() if bones else np.empty((0, 3))
+    if not len(points):
+        points = labels.grid.points(labels.labels > 0)
+        return np.asarray(points[np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1))])
+    return np.asarray(points[np.argmin(points[:, 2])])

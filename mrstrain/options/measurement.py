@@ -23,6 +23,17 @@ class BoneAndBody(Options):
     """Mask of the body. Default: found by an intensity threshold."""
 
 
+class Marks(Options):
+    """A few marks on the unloaded image."""
+
+    panel: ClassVar[str] = "Inputs"
+
+    marks: Path | None = None
+    """Label map of a few strokes in each tissue, from ITK-SNAP, 3D Slicer (.seg.nrrd) or any other program."""
+    mark_names: Path | None = None
+    """Table of the names of the marks: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon."""
+
+
 class SubjectFiles(BoneAndBody):
     """What is known of the unloaded image: its bone, body and tissues."""
 

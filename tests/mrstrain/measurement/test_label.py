@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import mrstrain
-from dvc import Image, read_image, read_labels, read_mask, write_image, write_mask
+from dvc import Image, LabelMap, read_image, read_labels, read_mask, write_image, write_labels, write_mask
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_names
+from mrstrain.measurement.label import read_marks
 from phantoms import Heel, heel_grid, labels_of, scan
 
 
@@ -50,9 +51,34 @@ def test_everything_is_written_and_agrees(folder: Path) -> None:
     assert told.endswith(f"Label map: {made / 'tissues.nii.gz'}")
 
 
+def test_marks_without_names_have_the_usual_ones(folder: Path, tmp_path: Path) -> None:
+    truth = labels_of(Heel(41), read_image(folder / "Load0.nii.gz").grid)
+    drawn = np.zeros_like(truth.labels)
+    for number, name in enumerate(("bone", "fat", "muscle", "skin", "tendon"), 1):
+        places = np.argwhere(truth.region(name).inside)
+        drawn[tuple(places[len(places) // 2])] = number
+    place = tmp_path / "strokes.nrrd"
+    write_labels(place, LabelMap(truth.grid, drawn, {n: f"label-{n}" for n in range(1, 6)}))
+    assert list(read_marks(place, None).names.values()) == ["bone", "fat", "muscle", "skin", "tendon"]
+    assert list(read_marks(place, tmp_path / "strokes.csv").names.values()) == [f"label-{n}" for n in range(1, 6)]
+    write_labels(
+        place, LabelMap(truth.grid, np.where(drawn == 5, 9, drawn), {n: f"label-{n}" for n in (1, 2, 3, 4, 9)})
+    )
+    with pytest.raises(InputError, match=r"marks \[9\] have no name"):
+        read_marks(place, None)
+    write_labels(place, LabelMap(truth.grid, drawn, {n: f"label-{n}" for n in range(1, 6)}))
+    load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "made.nii.gz"
+    mrstrain.label(load0, bone=bone, marks=place, out=out)
+    made = read_labels(out, tmp_path / "made.csv")
+    for number, name in ((2, "fat"), (3, "muscle"), (5, "tendon")):  # every mark has its tissue
+        assert (made.region(name).inside[drawn == number]).all()
+    record = json.loads((tmp_path / "made.json").read_text())
+    assert set(record["inputs"]) == {"load0", "bone", "marks"}
+
+
 def test_what_cannot_be_labelled_is_refused_before_anything_is_written(folder: Path, tmp_path: Path) -> None:
     load0, bone = folder / "Load0.nii.gz", folder / "bone.nii.gz"
-    with pytest.raises(InputError, match="needs the mask of a bone"):
+    with pytest.raises(InputError, match="need the mask of a bone"):
         mrstrain.label(load0, out=tmp_path / "a" / "t.nii.gz")
     with pytest.raises(InputError, match=r"must end in \.nii\.gz"):
         mrstrain.label(load0, bone=bone, out=tmp_path / "a" / "t.png")

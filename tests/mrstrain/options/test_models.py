@@ -21,6 +21,7 @@ from mrstrain.options.measurement import (
     BoneAndBody,
     Cores,
     EngineOptions,
+    Marks,
     MeshAndAxes,
     RegistrationOptions,
     Running,
@@ -52,6 +53,7 @@ from validate.curves import RANGE
 from validate.location import LEAST_ML
 
 COMMANDS: dict[str, tuple[type[Options], ...]] = {
+    "label": (BoneAndBody, Marks),
     "register": (SubjectFiles, RegistrationOptions, Scans, MeshAndAxes, Running),
     "strain": (SubjectFiles, MeshAndAxes),
     "phantom": (HeelShape,),
@@ -78,6 +80,7 @@ TABLES: dict[type[Options], tuple[str, str]] = {  # table of the study file, and
 }
 NOT_IN_A_STUDY = {  # what a study has in its own way
     Scans: "repeat and allow_missing are keys of [images]; a start and landmarks belong to a single load",
+    Marks: "a label map is made before a study",
     BoneAndBody: "part of SubjectFiles; a label map is made before a study",
     MeshAndAxes: "its directions are the plate's",
     Cores: "told when it is run",

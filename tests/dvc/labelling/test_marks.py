@@ -1,0 +1,92 @@
+"""Marks: bones found from a stroke, tissues that brightness alone does not find, and corrections that stay near."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from dvc import Grid, LabelMap, label_tissues
+from dvc.arrays import BoolArray
+from dvc.errors import InputError
+from dvc.labelling.marks import corrected, grown
+from phantoms import Heel, heel_grid, labels_of, scan
+from tests.dvc.labelling.test_tissues import dice
+
+GRID = Grid((40, 40, 40), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+SPACING = GRID.spacing_mm
+NAMES = {1: "Calcaneus", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "ankle"}
+
+
+def strokes(labels: LabelMap, counts: dict[int, int]) -> LabelMap:
+    """Strokes of 12 mm inside the tissues of a label map, so many of each."""
+    random, drawn = np.random.default_rng(6), np.zeros_like(labels.labels)
+    for number, count in counts.items():
+        deep = distance_transform_edt(labels.labels == number, sampling=labels.grid.spacing_mm)
+        inner = np.argwhere(deep > min(2.0, 0.6 * deep.max()))
+        for centre in inner[random.integers(len(inner), size=count)]:
+            along = np.eye(3)[random.integers(3)]
+            for step in np.arange(-6.0, 6.0, 0.5):
+                at = tuple(np.rint(centre + along * step / labels.grid.spacing_mm).astype(int))
+                if all(0 <= a < n for a, n in zip(at, drawn.shape, strict=True)) and labels.labels[at] == number:
+                    drawn[at] = number
+    return LabelMap(labels.grid, drawn, {number: NAMES[number] for number in counts})
+
+
+def test_a_heel_is_labelled_from_ten_strokes() -> None:
+    heel, grid = Heel(31), heel_grid(1.2)
+    truth = labels_of(heel, grid)
+    made = label_tissues(scan(heel, grid, snr=25.0, number=0), marks=strokes(truth, {1: 1, 2: 4, 3: 3, 4: 2}))
+    assert set(made.labels.names.values()) == {"Calcaneus", "fat", "muscle", "skin", "other bone"}
+    known = {name: truth.region(name).inside for name in truth.names.values()}
+    assert dice(made.labels.region("Calcaneus").inside, known["bone"]) > 0.93
+    assert dice(made.labels.region("fat").inside, known["fat"]) > 0.92
+    assert dice(made.labels.region("muscle").inside, known["muscle"] | known["tendon"]) > 0.92
+
+
+def test_a_mark_of_a_bone_outside_of_one_is_refused() -> None:
+    heel, grid = Heel(31), heel_grid(2.0)
+    truth = labels_of(heel, grid)
+    image = scan(heel, grid, snr=25.0, number=0)
+    in_fat = LabelMap(grid, (strokes(truth, {2: 1}).labels > 0).astype(int), {1: "talus"})
+    with pytest.raises(InputError, match="The mark of talus is not in marrow"):
+        label_tissues(image, marks=in_fat)
+    with pytest.raises(InputError, match="need the mask of a bone"):
+        label_tissues(image, marks=LabelMap(grid, in_fat.labels, {1: "fat"}))
+    with pytest.raises(InputError, match="need the mask of a bone"):
+        label_tissues(image)
+
+
+def cords() -> tuple[np.ndarray, BoolArray, BoolArray]:
+    """Muscle with two dark cords of 5 voxels across."""
+    i, j = GRID.points()[..., 0], GRID.points()[..., 1]
+    one, other = (np.hypot(i - at, j - at) < 2.6 for at in (10, 28))
+    values = np.where(one | other, 120.0, 400.0) + np.random.default_rng(7).normal(0.0, 40.0, GRID.shape)
+    return values.astype(np.float32), one, other
+
+
+def test_a_tissue_is_found_where_it_is_joined_to_its_mark_and_no_further() -> None:
+    values, one, _ = cords()
+    mark = one & (np.arange(40) == 20)
+    everywhere = np.ones(GRID.shape, dtype=bool)
+    found = grown(values, mark, everywhere, 400.0, SPACING)
+    assert dice(found > 0.5, one) > 0.95
+    assert found[mark].min() == 1.0
+    assert np.array_equal(
+        grown(np.full_like(values, 400.0), mark, everywhere, 410.0, SPACING) > 0.5, mark
+    )  # no contrast
+    assert not grown(values, np.zeros_like(mark), everywhere, 400.0, SPACING).any()
+
+
+def test_a_correction_follows_the_image_and_stays_near_its_mark() -> None:
+    i = np.broadcast_to(np.arange(40)[:, None, None], GRID.shape)
+    values = np.where(i < 20, 400.0, 600.0) + np.random.default_rng(8).normal(0.0, 20.0, GRID.shape)
+    wrong = np.stack([i < 26, i >= 26]).astype(np.float32)  # the border lies 6 voxels off
+    mark = np.zeros(GRID.shape, dtype=bool)
+    mark[21:25, 20, 20] = True
+    found = corrected(values.astype(np.float32), wrong, {1: mark}, GRID)
+    assert found.sum(axis=0) == pytest.approx(1.0, abs=1e-3)
+    far = distance_transform_edt(~mark) > 8.0
+    assert np.array_equal(found[:, far], wrong[:, far])
+    near = distance_transform_edt(~mark) < 4.0
+    assert np.mean((found[1] > 0.5) == (i >= 20), where=near) > 0.99
+    same = corrected(values.astype(np.float32), wrong, {0: (i < 10) & mark}, GRID)
+    assert np.array_equal(same, wrong)  # marks that agree change nothing
