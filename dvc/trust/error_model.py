@@ -8,7 +8,7 @@ that deviation. This holds for tissue that is strained and imaged like the study
 
 import json
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -37,7 +37,7 @@ _STEPS_OF_VOXELS = 2  # of the voxels at which truths of a map are drawn
 _MOST_NODES = 500_000  # of their lattice, which is coarser where it would have more
 _FEW = 2_000  # of a tissue's voxels on it, below which all are taken
 _HALF = 0.5 + 1e-6  # points half-way between nodes, as every second voxel may be, all take the upper one
-_DRAWS = 200
+_DRAWS, _AT_ONCE = 200, 10  # truths, and those that are in memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -361,17 +361,12 @@ def _figures_drawn(
     draws = TruthDraws(points, shear, tissue, to_bone_mm[every], table, seed, np.array(apart) * spacing_mm)
 
     def figures(truth: FloatArray) -> list[FloatArray]:
-        of_tissues = zip(np.split(truth, ends[:-1]), volumes_ml, strict=True)
-        return [figures_of(shear, volume) for shear, volume in of_tissues]
+        return [figures_of(*tissue) for tissue in zip(np.split(truth, ends[:-1]), volumes_ml, strict=True)]
 
-    begun = list[Future[list[FloatArray]]]()
-    with ThreadPoolExecutor(1) as beside:
-        for _ in range(_DRAWS):
-            truth = draws.drawn()  # while the figures of the one before are computed
-            if begun:
-                begun[-1].result()  # so that no more than two are in memory
-            begun.append(beside.submit(figures, truth))
-        return np.swapaxes([one.result() for one in begun], 0, 1)
+    with ThreadPoolExecutor(1) as beside:  # figures of one truth while the next is drawn
+        few = (beside.map(figures, (draws.drawn() for _ in range(_AT_ONCE))) for _ in range(_DRAWS // _AT_ONCE))
+        drawn = [each for some in few for each in some]
+    return np.swapaxes(drawn, 0, 1)
 
 
 def _voxels_apart(body: BoolArray, about: FloatArray) -> list[int]:

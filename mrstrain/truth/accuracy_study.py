@@ -11,7 +11,7 @@ from dvc import engine_named
 from dvc.atomic_files import whole_folder, write_csv, write_json
 from dvc.io.result_folder import FIGURES, PROVENANCE, REPORT
 from dvc.report.drawing import Drawing
-from dvc.report.page import Section, Table, record_lines, write_report
+from dvc.report.page import Cell, Section, Table, record_lines, write_report
 from dvc.trust.error_model import POOLED
 from mrstrain.records.provenance import provenance
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow, figures, wavelength_recovered
@@ -132,6 +132,10 @@ def _source(runs: Sequence[ErrorSamples]) -> str:
     return source
 
 
+_OF_ERRORS = (
+    "Error: measured minus true maximum shear strain (SD: standard deviation, RMSE: root mean square, p95: 95th "
+    "percentile of its magnitude). u: displacement; its error in mm."
+)
 _OF_FLOOR = (
     "MAER is the mean over voxels of the mean absolute value of the six strain components; SDER is its standard "
     "deviation over voxels."
@@ -150,11 +154,12 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], f
         "tissue", "true_p50", "true_p95", "shear_bias", "shear_sd", "shear_rmse", "shear_p95", "u_rmse_mm", "u_p95_mm"
     )
     labels = {off: f", labels {off:+d}" if off else "" for off in {r.labels_off for r in errors}}
-    rows = tuple((r.motion + labels[r.labels_off], *values(r)) for r in errors if r.by == "all")
-    tables = [Table("Error by motion and tissue", head, rows)]
+    rows = tuple((r.motion + labels[r.labels_off], *map(_told, values(r))) for r in errors if r.by == "all")
+    tables = [Table("Error by motion and tissue", head, rows, _OF_ERRORS)]
     if floors:
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
-        noise = tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in floors)
+        floor = attrgetter("tissue", "maer", "sder", "shear_p50", "shear_p95")
+        noise = tuple(tuple(map(_told, floor(f))) for f in floors)
         tables.append(Table("Noise floor: apparent strain between two unloaded scans", of_floor, noise, _OF_FLOOR))
     preset, voxel, snr = errors[0].condition
     pictures = []
@@ -167,6 +172,11 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], f
         where = f"{Path(preset).stem}_{voxel.replace(' ', '')}mm_snr{snr:g}"
         pictures.append(drawing.save(folder / f"{stem}_{where}"))
     return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=tuple(pictures))
+
+
+def _told(cell: Cell) -> Cell:
+    """A strain, or a length in mm, to three decimals: what is smaller is of no interest."""
+    return round(cell, 3) if isinstance(cell, float) else cell
 
 
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:

@@ -173,8 +173,8 @@ def test_no_more_than_a_few_truths_are_in_memory_at_once(monkeypatch: pytest.Mon
     fat[4:7, 4:7, 4:7] = True
     shear, far = np.full(GRID.shape, 0.2, dtype=np.float32), np.full(GRID.shape, 9.0, dtype=np.float32)
     uncertainty_of(shear, GRID, {"fat": fat}, far, TABLE)
-    assert len(waiting) > 100
-    assert max(waiting) <= 3
+    assert len(waiting) == 200
+    assert max(waiting) <= 10
 
 
 def test_intervals_cover_the_truth_as_often_as_they_claim() -> None:
