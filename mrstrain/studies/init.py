@@ -12,7 +12,8 @@ from dvc import read_image, read_labels
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, OutputError
 from dvc.io.images.dicom import is_dicom, is_multiframe
-from fe import published_names
+from dvc.measurement.subject import is_bones_name
+from fe import BONE, published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.simulate import LOADS
 from mrstrain.options.modelling import Directions
@@ -140,7 +141,9 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
     template = environment.from_string(source.read_text(encoding="utf-8"))
     forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
     sets = [name for name in published_names() if not name.endswith(_VARIANT) and name != _SOFTEST]
-    write_whole(target, template.render(found=found, name=name, answers=answers, forces=forces, sets=sets))
+    bones = _bones(place, found, names, answers.bone or BONE)
+    told = {"found": found, "name": name, "answers": answers, "forces": forces, "sets": sets, "bones": bones}
+    write_whole(target, template.render(told))
     return NewStudy(target, found, picture)
 
 
@@ -163,6 +166,17 @@ def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
     except InputError as error:
         return f"none, {error}", []
     return place / PICTURE, names
+
+
+def _bones(place: Path, found: StudyInputs, names: Sequence[str], bone: str) -> list[str]:
+    """The bone, and the other labels of the map to be meshed that are named like one."""
+    if found.mesh_labels is not None:
+        try:
+            meshed = read_labels(place / found.mesh_labels, found.mesh_names and place / found.mesh_names)
+            names = [name for number, name in meshed.names.items() if number != 0]
+        except InputError:
+            names = []
+    return [bone, *(name for name in names if is_bones_name(name) and name != bone)]
 
 
 def _look(place: Path) -> StudyInputs:
@@ -215,6 +229,8 @@ def _holds_dicom(folder: Path) -> bool:
 
 def _role(stem: str) -> str | None:
     """Role that the name of an image suggests: a field of `StudyInputs`, or "load"; None if it suggests none."""
+    if stem.endswith("_probability"):  # of a label map that `label` made
+        return None
     if _LABELS.search(stem):
         return "mesh_labels" if _TO_MESH.search(stem) else "labels"
     if _BONE.search(stem):

@@ -214,6 +214,15 @@ def asked_init(place: Path, *lines: str) -> tuple[NewStudy, list[str]]:
     return init(place, ask=partial(ask, read=read)), asked
 
 
+def test_every_label_named_like_a_bone_is_cut_out_of_the_mesh(tmp_path, tiny_pair):
+    place = heel_in(tmp_path, tiny_pair)
+    write_labels(place / "tissues_to_mesh.nii.gz", replace(tiny_pair.labels, labels=tiny_pair.labels.labels))
+    (place / "tissues_probability.nii.gz").write_bytes(b"")  # written beside a label map, and none itself
+    told = "\n".join(init(place).summary())
+    assert read_study(place).mesh.bones == ("bone", "ankle")
+    assert "NOT USED: tissues_probability.nii.gz" in told
+
+
 def test_answers_stand_in_the_study_file(tmp_path, tiny_pair, capsys):
     place = heel_in(tmp_path, tiny_pair)
     begun, asked = asked_init(
@@ -230,7 +239,7 @@ def test_answers_stand_in_the_study_file(tmp_path, tiny_pair, capsys):
     assert "'abc': a number is needed" in told
     assert "'1 0': three numbers are needed" in told
     study = read_study(place)
-    assert (study.bone, study.images.bone, study.mesh.bones) == ("ankle", None, ("ankle",))
+    assert (study.bone, study.images.bone, study.mesh.bones) == ("ankle", None, ("ankle", "bone"))
     forces = {name: (load.normal_n, load.shear_n) for name, load in study.loads.items()}
     assert forces == {"Load1": (140.0, 0.0), "Load2": (15.0, -45.5)}
     assert study.plate.plate_normal == (0.0, 0.1, -1.0)
