@@ -24,8 +24,12 @@ Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 TOO_LITTLE_MEMORY = "Free memory, use fewer --workers, crop the images, or use a coarser mesh."
 """What to do where memory ran out."""
-# What the system says of memory for a library, a process or a thread, each in an error of another kind.
-_NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "can't start new thread", "paging file is too small")
+# What the system says of memory for a library, a process or a thread, each in an error of another kind; and the line of
+# a traceback that loky gives as text, as where there is no memory to send a task.
+_NO_MEMORY = (
+    "failed to map segment", "Cannot allocate memory", "can't start new thread", "paging file is too small",
+    "\nMemoryError",
+)  # fmt: skip
 _POLL_S = 0.5
 _UNWIND_S = 5.0  # for threads to end after an error or interrupt
 _MEMORY = {

@@ -38,7 +38,7 @@ _COMMANDS: tuple[tuple[list[str], str], ...] = (
     ([], "mrstrain demo"),
     (["--version"], "mrstrain 0"),
     (["doctor"], "ok   package names"),
-    (["phantom", "--out", "{there}/heel", "--load", "Load1", "--spacing", "2.4"], ""),
+    (["phantom", "--out", "{there}/heel", "--load", "Load1", "--spacing", "2.0"], ""),
     (["register", "{there}/heel/Load0.nii.gz", "{there}/heel/Load1.nii.gz", "--bone", "{there}/heel/calcaneus.nii.gz",
       "--labels", _LABELS, *_NAMES, "--out", "{there}/measured", "--workers", "1", "--threads", "1"], "report.html"),
     (["mesh", "{there}/heel/tissues_to_mesh.nii.gz", "--names", "{there}/heel/tissues_to_mesh.csv", "--edge-mm", "6",

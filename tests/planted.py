@@ -11,14 +11,16 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import nibabel
 import numpy as np
 import pydicom
 from pydicom.dataset import FileDataset, FileMetaDataset
-from pydicom.uid import ExplicitVRLittleEndian, MRImageStorage
+from pydicom.uid import EnhancedMRImageStorage, ExplicitVRLittleEndian, MRImageStorage
 
 from dvc import Image
+from tests.dicomfiles import item
 
 NAME, NUMBER, PLACE, DATE, BORN = "Quixote^Dulcinea", "MRN-7719404", "Toboso General", "19470823", "1947-08-23"
 PLANTED = (NAME, NAME.partition("^")[0], NUMBER, PLACE, DATE, BORN)
@@ -47,30 +49,68 @@ def plant_in_nrrd(path: Path) -> None:
 def write_dicom(folder: Path, image: Image) -> None:
     """An image as a classic DICOM series with the names in it."""
     folder.mkdir()
-    grid, slope = image.grid, float(image.values.max()) / 4000.0
-    axes = np.asarray(grid.direction)
-    for k in range(grid.shape[2]):
-        meta = FileMetaDataset()
-        meta.MediaStorageSOPClassUID, meta.TransferSyntaxUID = MRImageStorage, ExplicitVRLittleEndian
-        meta.MediaStorageSOPInstanceUID = f"1.2.3.{k + 1}"
-        one = FileDataset("", {}, file_meta=meta, preamble=bytes(128))
-        place = np.asarray(grid.origin_mm) + axes[:, 2] * grid.spacing_mm[2] * k
-        stored = np.rint(image.values[:, :, k] / slope).astype("<i2")
-        for field, value in {
-            "SOPClassUID": MRImageStorage, "SOPInstanceUID": f"1.2.3.{k + 1}", "SeriesInstanceUID": "1.2.3",
-            "PatientName": NAME, "PatientID": NUMBER, "InstitutionName": PLACE, "PatientBirthDate": DATE,
-            "StudyDate": DATE, "SeriesDescription": NAME, "ReferringPhysicianName": NAME, "ImageComments": PLACE,
-            "Modality": "MR", "ImageType": ["ORIGINAL", "PRIMARY", "M"], "RescaleSlope": f"{slope:.8g}",
-            "RescaleIntercept": "0", "ImagePositionPatient": [f"{v:.6f}" for v in place],
-            "ImageOrientationPatient": [f"{v:.8f}" for v in (*axes[:, 0], *axes[:, 1])],
-            "PixelSpacing": [f"{grid.spacing_mm[1]:.6g}", f"{grid.spacing_mm[0]:.6g}"], "Columns": grid.shape[0],
-            "Rows": grid.shape[1], "SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2",
-            "BitsAllocated": 16, "BitsStored": 16, "HighBit": 15, "PixelRepresentation": 1,
-            "PixelData": stored.T.tobytes(),
-        }.items():  # fmt: skip
-            setattr(one, field, value)
-        one["PixelData"].VR = "OW"
-        pydicom.dcmwrite(folder / f"{k:03d}.dcm", one, enforce_file_format=True)
+    around, scaling, places = _geometry(image)
+    for k, place in enumerate(places):
+        own = {"SOPInstanceUID": f"1.2.3.{k + 1}", **around, **scaling, **place, "ImageComments": PLACE}
+        _write(folder / f"{k:03d}.dcm", MRImageStorage, own, _stored(image, scaling)[k : k + 1])
+
+
+def write_enhanced_dicom(path: Path, image: Image) -> None:
+    """An image as one enhanced (multi-frame) DICOM file with the names in it, also in its sequences and frames."""
+    around, scaling, places = _geometry(image)
+    measures = {"PixelSpacing": around.pop("PixelSpacing"), "SliceThickness": str(image.grid.spacing_mm[2])}
+    shared = {
+        "PlaneOrientationSequence": [item(ImageOrientationPatient=around.pop("ImageOrientationPatient"))],
+        "PixelMeasuresSequence": [item(**measures)], "PixelValueTransformationSequence": [item(**scaling)],
+    }  # fmt: skip
+    frames = [
+        item(
+            PlanePositionSequence=[item(**place)],
+            FrameContentSequence=[item(FrameComments=f"{NAME} {BORN}", StackID="1", InStackPositionNumber=k)],
+            FrameAnatomySequence=[item(AnatomicRegionSequence=[item(CodeMeaning=f"heel of {NAME}")])],
+        )
+        for k, place in enumerate(places, start=1)
+    ]
+    asked = item(RequestedProcedureDescription=NAME, ReasonForTheRequestedProcedure=PLACE)
+    own = {
+        "SOPInstanceUID": "1.2.3.1", **around, "NumberOfFrames": len(frames), "RequestAttributesSequence": [asked],
+        "SharedFunctionalGroupsSequence": [item(**shared)], "PerFrameFunctionalGroupsSequence": frames,
+    }  # fmt: skip
+    _write(path, EnhancedMRImageStorage, own, _stored(image, scaling))
+
+
+def _geometry(image: Image) -> tuple[dict[str, Any], dict[str, str], list[dict[str, list[str]]]]:
+    """Elements of an image and its patient, of the scaling of its values, and the place of each slice."""
+    grid, axes = image.grid, np.asarray(image.grid.direction)
+    around = {
+        "SeriesInstanceUID": "1.2.3", "ImageType": ["ORIGINAL", "PRIMARY", "M", "NONE"], "Modality": "MR",
+        "ImageOrientationPatient": [f"{v:.8f}" for v in (*axes[:, 0], *axes[:, 1])],
+        "PixelSpacing": [f"{grid.spacing_mm[1]:.6g}", f"{grid.spacing_mm[0]:.6g}"], "Columns": grid.shape[0],
+        "Rows": grid.shape[1], "PatientName": NAME, "PatientID": NUMBER, "InstitutionName": PLACE,
+        "PatientBirthDate": DATE, "StudyDate": DATE, "SeriesDescription": NAME, "ReferringPhysicianName": NAME,
+    }  # fmt: skip
+    places = np.asarray(grid.origin_mm) + np.arange(grid.shape[2])[:, None] * axes[:, 2] * grid.spacing_mm[2]
+    scaling = {"RescaleSlope": f"{image.values.max() / 4000.0:.8g}", "RescaleIntercept": "0", "RescaleType": "US"}
+    return around, scaling, [{"ImagePositionPatient": [f"{v:.6f}" for v in place]} for place in places]
+
+
+def _stored(image: Image, scaling: dict[str, str]) -> np.ndarray:
+    """Slices, rows, columns as they are stored."""
+    return np.rint(image.values.T / float(scaling["RescaleSlope"])).astype("<i2")
+
+
+def _write(path: Path, kind: str, elements: dict[str, Any], stored: np.ndarray) -> None:
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID, meta.TransferSyntaxUID = kind, ExplicitVRLittleEndian
+    meta.MediaStorageSOPInstanceUID = elements["SOPInstanceUID"]
+    one = FileDataset("", {}, file_meta=meta, preamble=bytes(128))
+    for field, value in {
+        "SOPClassUID": kind, **elements, "SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2",
+        "BitsAllocated": 16, "BitsStored": 16, "HighBit": 15, "PixelRepresentation": 1, "PixelData": stored.tobytes(),
+    }.items():  # fmt: skip
+        setattr(one, field, value)
+    one["PixelData"].VR = "OW"
+    pydicom.dcmwrite(path, one, enforce_file_format=True)
 
 
 def planted_in(folder: Path, words: tuple[str, ...] = PLANTED) -> list[str]:

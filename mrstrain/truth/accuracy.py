@@ -15,7 +15,7 @@ from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
-from mrstrain.records.inputs import make_output, refuse_small_disk
+from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 from mrstrain.truth.accuracy_study import AccuracyStudy
@@ -105,17 +105,18 @@ def accuracy(
     missing = [case for case in wanted if case.name not in runs]
     refuse_small_disk(target, len(missing) * _MEGABYTES * 1e6 + 20e6, "the study needs", ", or a smaller study")
     make_output(target)
-    folder.mkdir(exist_ok=True)
     at_once = max(1, min(workers or usable_cores(), len(missing)))
     if tell_plan is not None:
         tell_plan(
             f"Registrations to run: {len(missing)}, {at_once} at a time, in about "
             f"{expected_minutes(missing, at_once):.0f} min; already done: {len(wanted) - len(missing)}."
         )
-    failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
-    if not runs:
-        raise MrstrainError(with_reasons("No case could be measured.", [f"{n}: {r}" for n, r in failures.items()]))
-    return AccuracyStudy.of(target, [runs[name] for name in sorted(runs)], failures)
+    with alone(target):
+        folder.mkdir(exist_ok=True)
+        failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
+        if not runs:
+            raise MrstrainError(with_reasons("No case could be measured.", [f"{n}: {r}" for n, r in failures.items()]))
+        return AccuracyStudy.of(target, [runs[name] for name in sorted(runs)], failures)
 
 
 def _finished(folder: Path) -> dict[str, ErrorSamples]:

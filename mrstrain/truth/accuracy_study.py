@@ -1,7 +1,7 @@
 """Result of an accuracy study: its tables, an error model of each preset, and a report that says how to read them."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -64,6 +64,9 @@ class AccuracyStudy:
     @classmethod
     def of(cls, out: Path, runs: Sequence[ErrorSamples], failures: dict[str, str]) -> Self:
         """Make the tables of all runs, and write them with error models, provenance and a self-contained report."""
+        texts = {preset: engine_named(preset).text for preset in dict.fromkeys(r.case.preset for r in runs)}
+        # Folders of parameter files may name a patient: only the samples, from which a study goes on, keep them.
+        runs = [replace(r, case=replace(r.case, preset=Path(r.case.preset).name)) for r in runs]
         errors, floors = tuple(phantoms.error_rows(runs)), tuple(phantoms.floor_rows(runs))
         resolution, coverage = tuple(phantoms.resolution_rows(runs)), tuple(phantoms.coverage_rows(runs))
         tables: dict[str, tuple[type[Any], Sequence[Any]]] = {
@@ -75,7 +78,7 @@ class AccuracyStudy:
         }
         for name, (kind, rows) in tables.items():
             write_csv(out / f"{name}.csv", [f.name for f in fields(kind)], map(astuple, rows))
-        presets = {preset: engine_named(preset).text for preset in dict.fromkeys(r.case.preset for r in runs)}
+        presets = {Path(preset).name: text for preset, text in texts.items()}
         for preset, text in presets.items():
             some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume and r.case.wavelength_mm is None]
             if some:

@@ -97,6 +97,20 @@ def test_a_library_that_there_is_no_memory_for_is_lack_of_memory():
         worker.run("meshing", _needs_a_library_that_does_not_fit)
 
 
+class _TooLargeToSend:
+    """What there is no memory for to pickle it."""
+
+    def __reduce__(self):
+        raise MemoryError
+
+
+def test_memory_that_runs_out_while_a_task_is_sent_is_lack_of_memory():
+    with Worker(threads=1) as worker:
+        with pytest.raises(WorkerError, match=r"memory ran out while aligning .*Free memory"):
+            worker.run("aligning", len, [_TooLargeToSend()])
+        assert worker.run("adding", sum, [1, 2]) == 3
+
+
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])
 def test_death_is_an_error_that_says_so_and_the_next_task_runs(task, signal_name):
     with Worker(threads=1) as worker:

@@ -4,15 +4,31 @@ from __future__ import annotations
 
 import base64
 import gzip
+import shutil
 import zlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from dvc import write_image, write_labels, write_mask
-from mrstrain import register
-from tests.planted import BORN, NAME, NUMBER, PLACE, PLANTED, plant_in_nifti, plant_in_nrrd, planted_in, write_dicom
+from dvc import read_image, write_image, write_labels, write_mask
+from mrstrain import accuracy, register, strain, twin
+from tests.phantoms.test_error_tables import CASE, samples
+from tests.planted import (
+    BORN,
+    NAME,
+    NUMBER,
+    PLACE,
+    PLANTED,
+    plant_in_nifti,
+    plant_in_nrrd,
+    planted_in,
+    write_dicom,
+    write_enhanced_dicom,
+)
+from tests.quick import QUICK
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -23,6 +39,7 @@ def inputs(made_once, tiny_pair) -> Path:
 
     def fill(folder: Path) -> None:
         write_dicom(folder / "Load0", tiny_pair.reference)
+        write_enhanced_dicom(folder / "enhanced.dcm", tiny_pair.reference)
         write_image(folder / "Load1.nrrd", tiny_pair.loaded)
         write_image(folder / "again.nii.gz", tiny_pair.repeat)
         write_mask(folder / "bone.nii.gz", tiny_pair.bone)
@@ -78,3 +95,50 @@ def registered(made_once, inputs: Path) -> Path:
 def test_a_registration_names_no_patient(inputs: Path, registered: Path) -> None:
     assert {one.rpartition(": ")[2] for one in planted_in(inputs)} == set(PLANTED)
     assert planted_in(registered) == []
+
+
+def test_an_enhanced_file_holds_all_names_and_is_read_as_the_series_is(inputs: Path) -> None:
+    assert {one for one in PLANTED if f"{inputs / 'enhanced.dcm'}: {one}" in planted_in(inputs)} == set(PLANTED)
+    one, other = read_image(inputs / "enhanced.dcm"), read_image(inputs / "Load0")
+    assert one.grid.same_as(other.grid)
+    assert np.array_equal(one.values, other.values)
+
+
+@pytest.fixture
+def measured(inputs: Path, registered: Path, tmp_path: Path) -> Path:
+    """A displacement image of a registration, with the patient in its header."""
+    whole = tmp_path / "given" / "measured.nii.gz"
+    whole.parent.mkdir()
+    shutil.copy(registered / "out" / "Load1" / "displacement.nii.gz", whole)
+    plant_in_nifti(whole)
+    assert planted_in(whole.parent)
+    return whole
+
+
+@pytest.mark.parametrize("load0", ["Load0", "enhanced.dcm"])
+@pytest.mark.parametrize("command", [strain, twin])
+def test_strain_and_twin_name_no_patient(
+    inputs: Path, measured: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: Any, load0: str
+) -> None:
+    done = command(
+        inputs / load0, measured, out=tmp_path / "out", frame="LPS", bone=inputs / "bone.nii.gz",
+        labels=inputs / "tissues.nrrd", names=inputs / "tissues.csv",
+    )  # fmt: skip
+    assert len([file for file in (tmp_path / "out").rglob("*") if file.is_file()]) > 5
+    assert planted_in(tmp_path / "out") == []
+    printed = "\n".join([*done.summary(), *capfd.readouterr()])
+    assert not [word for word in PLANTED if word in printed]
+
+
+def test_an_accuracy_study_tells_no_folder_of_its_parameter_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its input that may name a patient; the samples keep the path, since from them the study goes on."""
+    given = tmp_path / NAME / NUMBER / "mine.txt"
+    given.parent.mkdir(parents=True)
+    given.write_text(QUICK)
+    monkeypatch.setattr("mrstrain.truth.accuracy.measure_run", lambda case, *_: samples(case))
+    study = accuracy(tmp_path / "out", cases=[replace(CASE, preset=str(given))], workers=1)
+    assert "mine.txt, " in (tmp_path / "out" / "report.html").read_text()
+    assert all(row.preset == "mine.txt" for row in study.errors)
+    assert {one.split("/out/")[1].split("/")[0] for one in planted_in(tmp_path / "out")} == {"runs"}
