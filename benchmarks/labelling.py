@@ -1,0 +1,119 @@
+"""Labels made from the image: overlap with the truth by tissue, where skin ends, and the strain measured with them.
+
+    python -m benchmarks.labelling --seeds 41 42 43 --out benchmarks/results/labelling.json
+    python -m benchmarks.labelling --seeds 41 42 --motions smooth sliding Load1 Load3 --out benchmarks/results/labelling.json
+
+Heels at 0.8 mm and SNR 25, labelled from the mask of the bone, and from ten strokes of 12 mm at random places (bone,
+4 in fat, 3 in muscle, 2 in skin). Dice coefficients by tissue (tendon counts as muscle, and other bones as one), the
+distance (mm) from the border of skin to the true one, and seconds on one thread. With motions, pairs are registered with the
+exact labels, with those from the bone's mask, and without; root mean square errors of the max. shear by tissue.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.engines import ENGINES, errors, motion_of
+from dvc import LabelMap, Mask, TissueLabels, label_tissues, register, tissue_mask
+from dvc.arrays import BoolArray
+from dvc.images.depth import depth_mm
+from mrstrain.records.provenance import versions
+from phantoms import Heel, HeelPair, heel_grid, heel_pair, labels_of, scan
+
+STROKES = {"bone": 1, "fat": 4, "muscle": 3, "skin": 2}
+STROKE_MM = 12.0
+
+
+def strokes(labels: LabelMap, seed: int) -> LabelMap:
+    """Strokes along the axes of the image in the middle of the tissues, at random places."""
+    random, drawn = np.random.default_rng(seed), np.zeros_like(labels.labels)
+    numbers = {name: number for number, name in labels.names.items()}
+    spacing = labels.grid.spacing_mm
+    for name, count in STROKES.items():
+        depth = depth_mm(labels.labels == numbers[name], spacing)
+        inner = np.argwhere(depth > min(2.0, 0.6 * float(depth.max())))
+        for centre in inner[random.integers(len(inner), size=count)]:
+            along = np.eye(3)[random.integers(3)] / spacing
+            path = np.rint(centre + np.linspace(-0.5, 0.5, 31)[:, None] * STROKE_MM * along).astype(int)
+            path = path[np.all((path >= 0) & (path < drawn.shape), axis=1)]
+            path = path[labels.labels[tuple(path.T)] == numbers[name]]
+            drawn[tuple(path.T)] = numbers[name]
+    return LabelMap(labels.grid, drawn, {numbers[name]: name for name in STROKES})
+
+
+def dice(a: BoolArray, b: BoolArray) -> float:
+    return float(2.0 * np.count_nonzero(a & b) / max(1, np.count_nonzero(a) + np.count_nonzero(b)))
+
+
+def figures(made: TissueLabels, truth: LabelMap) -> dict[str, float]:
+    """Overlap by tissue, and how far the border of skin is off."""
+    true = {name: truth.labels == number for number, name in truth.names.items()}
+    true |= {"muscle": true["muscle"] | true["tendon"], "other bone": true["ankle"]}
+    found = {name: made.labels.labels == number for number, name in made.labels.names.items()}
+    told = {name: dice(found[name], true[name]) for name in found}
+    flesh = [depth_mm((of > 0) & ~skin, truth.grid.spacing_mm) for of, skin in (
+        (truth.labels, true["skin"]), (made.labels.labels, found.get("skin", np.zeros_like(true["skin"])))
+    )]  # fmt: skip
+    at_border = (np.abs(flesh[0]) < 0.5 * float(truth.grid.spacing_mm.mean())) & (truth.labels > 0)
+    off = (flesh[1] - flesh[0])[at_border]
+    return told | {"skin_border_bias_mm": float(off.mean()), "skin_border_rms_mm": float(np.sqrt((off**2).mean()))}
+
+
+def labelled(seed: int) -> dict[str, object]:
+    heel, grid = Heel(seed), heel_grid(0.8)
+    image, truth = scan(heel, grid, snr=25.0, number=0), labels_of(heel, grid)
+    rows: dict[str, object] = {"seed": seed}
+    for name, given in (("bone", {"bone": truth.region("bone")}), ("strokes", {"marks": strokes(truth, seed)})):
+        began = time.process_time()
+        made = label_tissues(image, **given)  # type: ignore[arg-type]
+        rows[name] = figures(made, truth) | {"unsure": made.unsure, "processor_s": time.process_time() - began}
+        print(seed, name, {key: round(float(value), 3) for key, value in rows[name].items()}, flush=True)  # type: ignore[attr-defined]
+    return rows
+
+
+def measured(pair: HeelPair, seed: int, motion: str) -> list[dict[str, object]]:
+    """Errors of the max. shear with exact labels, with labels from the bone's mask, and without labels."""
+    body, exact = tissue_mask(pair.reference), Mask(pair.labels.grid, pair.labels.labels > 0)
+    made = label_tissues(pair.reference, pair.bone)
+    rows = []
+    for name, labels, tissue, engine in (
+        ("exact", pair.labels, exact, "gauss-newton, labels"),
+        ("from the image", made.labels, body, "gauss-newton, labels"),
+        ("none", None, body, "gauss-newton"),
+    ):
+        found = register(
+            pair.reference, pair.loaded, bone=pair.bone, tissue=tissue, labels=labels,
+            settings=replace(ENGINES[engine], threads=2),
+        )  # fmt: skip
+        of = errors(pair, still=False, found=found.displacement)
+        rows.append({"seed": seed, "motion": motion, "labels": name, "errors": of})
+        print(seed, motion, name, {key: round(value["shear_rmse"], 4) for key, value in of.items()}, flush=True)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", required=True)
+    parser.add_argument("--motions", nargs="*", default=[])
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    told = json.loads(given.out.read_text()) if given.out.is_file() else {}
+    told |= {"versions": versions()}
+    for seed in given.seeds:
+        for motion in given.motions:
+            pair = heel_pair(seed=seed, motion=motion_of(Heel(seed), motion))
+            told.setdefault("strain", []).extend(measured(pair, seed, motion))
+            given.out.write_text(json.dumps(told, indent=1) + "\n")
+        if not given.motions:
+            told.setdefault("labels", []).append(labelled(seed))
+            given.out.write_text(json.dumps(told, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
