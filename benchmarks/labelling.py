@@ -1,12 +1,13 @@
 """Labels made from the image: overlap with the truth by tissue, where skin ends, and the strain measured with them.
 
-    python -m benchmarks.labelling --seeds 41 42 43 --out benchmarks/results/labelling.json
-    python -m benchmarks.labelling --seeds 41 42 --motions smooth sliding Load1 Load3 --out benchmarks/results/labelling.json
+    python -m benchmarks.labelling --seeds 41 42 43 --out labelling.json
+    python -m benchmarks.labelling --seeds 41 42 --motions smooth sliding Load1 Load3 --out labelling.json
 
 Heels at 0.8 mm and SNR 25, labelled from the mask of the bone, and from ten strokes of 12 mm at random places (bone,
 4 in fat, 3 in muscle, 2 in skin). Dice coefficients by tissue (tendon counts as muscle, and other bones as one), the
-distance (mm) from the border of skin to the true one, and seconds on one thread. With motions, pairs are registered with the
-exact labels, with those from the bone's mask, and without; root mean square errors of the max. shear by tissue.
+distance (mm) from the border of skin to the true one, and seconds on one thread. With motions, pairs are registered
+with the exact labels, with those from the bone's mask, and without; root mean square errors of the max. shear by
+tissue. Results are added to those that the file holds.
 """
 
 from __future__ import annotations
