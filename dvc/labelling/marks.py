@@ -12,7 +12,7 @@ from dvc.images.image import Grid, Mask
 from dvc.images.tissue import within
 from dvc.labelling.brightness import Levels, brighter_share
 
-_BORDER_MM = 0.35  # of a marked tissue, which may be a sheet of two voxels
+_BORDER_MM = 0.1  # of a marked tissue, which may be a sheet of two voxels
 _REACH_MM = 8.0  # of a correction
 _BLUR_MM = 0.5
 _EVEN = 3.0  # times the median step between neighbouring voxels: a walk avoids larger steps
