@@ -19,6 +19,8 @@ _WIDE_MM = 5.0  # standard deviation of the neighbourhood whose profile is fitte
 _BLOCK_MM = 2.5
 _VARIES_MM = 0.4  # standard deviation of the thickness over the body
 _LEVEL_WEIGHT = 0.02  # of what the levels are in the whole body, as a share of a profile
+_AWAY = 4  # voxels from the body: only air
+_LEAST_DEPTHS = 5  # with values, of a profile: more than what is fitted
 _LEAST_CONTRAST = 0.15  # between skin and what is below it, as a share of the brightness of the latter
 _LEAST_SPREAD = 0.25  # voxels, of the border: where a voxel's centre lies is not known better from its brightness
 
@@ -60,10 +62,13 @@ class Skin:
         """
         spacing = image.grid.spacing_mm
         depth = depth_mm(body.inside, spacing)
-        air = float(np.median(image.values[~binary_dilation(body.inside, iterations=4)]))
+        outside = ~binary_dilation(body.inside, iterations=_AWAY)
         profiles = _Profiles.of(image, depth, ~without & np.isfinite(image.values))
         voxel = float(spacing.mean())
         values, weights = profiles.pooled()
+        if not outside.any() or np.count_nonzero(weights) < _LEAST_DEPTHS:
+            return None  # the image shows no surface
+        air = float(np.median(image.values[outside]))
         whole = _fitted(values - air, weights, voxel, None)
         skin, below = whole.levels[0]
         if not _LEAST_CONTRAST * below < below - skin < below:
@@ -147,7 +152,7 @@ class _Fit:
 
 def _fitted(values: FloatArray, weights: FloatArray, voxel_mm: float, whole: "_Fit | None") -> _Fit:
     """Fit profiles (n, depths) above the air: mean over the thicknesses tried, by how likely they are."""
-    known = (weights > 0.0).sum(axis=1) > 4
+    known = (weights > 0.0).sum(axis=1) >= _LEAST_DEPTHS
     y, w = values[known], weights[known]
     cost = np.full((len(_THICK_MM), len(y)), np.inf)
     shift, levels = np.zeros(cost.shape), np.zeros((*cost.shape, 2))

@@ -106,11 +106,15 @@ def label_tissues(
     chance |= _below_skin(even.values, soft & (left > 0.5), left, spacing, marked)
     if "muscle" not in chance:
         notes.append("One tissue was found below the skin: its brightness does not separate fat from muscle.")
+    unused = [name for name, mark in marked.items() if name not in chance and (mark & ~known).any()]
+    notes += [
+        f"The marks of {name} were not used: the image does not show it as a tissue of its own." for name in unused
+    ]
     watch(0.9)
     names = [name for name in NAMES.values() if name in chance] + sorted(set(chance) - {*NAMES.values()})
     probability = frozen(np.stack([chance[name] for name in names]), np.float32)
     if marked:
-        at = {names.index(name): mark & whole for name, mark in marked.items()}
+        at = {names.index(name): mark & whole for name, mark in marked.items() if name in chance}
         probability = frozen(corrected(even.values, probability, at, grid), np.float32)
     numbered = {number: name for number, name in NAMES.items() if name in chance}
     numbered |= dict(enumerate(names[len(numbered) :], len(NAMES) + 1))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from dvc import Grid, LabelMap, label_tissues
+from dvc import Grid, Image, LabelMap, Mask, label_tissues
 from dvc.arrays import BoolArray
 from dvc.errors import InputError
 from dvc.labelling.marks import corrected, grown
@@ -53,6 +53,20 @@ def test_a_mark_of_a_bone_outside_of_one_is_refused() -> None:
         label_tissues(image, marks=LabelMap(grid, in_fat.labels, {1: "fat"}))
     with pytest.raises(InputError, match="need the mask of a bone"):
         label_tissues(image)
+
+
+def test_marks_that_cannot_be_used_are_told() -> None:
+    """Of one tissue below no skin, with a bone that is given: another name of it needs no second bone."""
+    radius = np.linalg.norm(GRID.points() - GRID.centre_mm, axis=-1)
+    values = np.where(radius < 17.0, 500.0, 0.0) + np.random.default_rng(9).normal(0.0, 10.0, GRID.shape)
+    drawn = np.select([radius < 2.0, (radius > 9.0) & (radius < 11.0), (radius > 15.0) & (radius < 16.0)], [1, 2, 3], 0)
+    marks = LabelMap(GRID, drawn, {1: "Calcaneus", 2: "tendon", 3: "skin"})
+    made = label_tissues(Image(GRID, values), Mask(GRID, radius < 5.0), marks=marks)
+    assert set(made.labels.names.values()) == {"bone", "fat"}
+    told = "\n".join(made.notes)
+    assert "marks of tendon were not used" in told
+    assert "marks of skin were not used" in told
+    assert "Calcaneus" not in told
 
 
 def cords() -> tuple[np.ndarray, BoolArray, BoolArray]:

@@ -67,6 +67,16 @@ def test_what_has_no_darker_layer_has_no_skin() -> None:
     assert skin_of(shell(2.0, (400.0, 600.0)))[0] is not None
 
 
+def test_a_body_that_fills_the_image_shows_no_skin() -> None:
+    grid = Grid((24, 24, 24), SPACING, np.zeros(3))
+    image = Image(grid, np.random.default_rng(5).normal(600.0, 20.0, grid.shape))
+    nothing = np.zeros(grid.shape, dtype=bool)
+    assert Skin.of(image, Mask(grid, ~nothing), nothing) is None
+    few = nothing.copy()
+    few[11:13, 11:13, 11:13] = True
+    assert Skin.of(image, Mask(grid, few), ~few) is None
+
+
 def two_halves(noise: float, step: float = 200.0) -> tuple[FloatArray, BoolArray]:
     values = np.full((40, 40, 40), 400.0)
     bright = np.zeros(values.shape, dtype=bool)
