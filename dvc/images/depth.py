@@ -16,10 +16,11 @@ NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm
 
 
 def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
-    """Signed distance from a mask's border, mm, positive inside; the border is smooth, and not made of voxels' faces.
+    """Signed distance (ni, nj, nk) from the border of a mask (ni, nj, nk), mm, positive inside; voxels of (3,) mm.
 
-    Blurred by a Gaussian of s, a plane's mask is the normal distribution of the distance over s, which gives the
-    distance near the border. Further away it is that to the nearest place of this border.
+    The border is smooth, and not made of voxels' faces. Blurred by a Gaussian of s, a plane's mask is the normal
+    distribution of the distance over s, which gives the distance near the border. Further away it is that to the
+    nearest place of this border.
     """
     blurred = gaussian_filter(inside.astype(np.float64), _BLUR, mode="nearest")
     sure = (blurred > _SURE) & (blurred < 1.0 - _SURE)

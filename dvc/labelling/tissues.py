@@ -119,6 +119,7 @@ def label_tissues(
     numbered = {number: name for number, name in NAMES.items() if name in chance}
     numbered |= dict(enumerate(names[len(numbered) :], len(NAMES) + 1))
     labels = np.where(whole, np.array([*numbered])[probability.argmax(axis=0)], 0)
+    watch(1.0)
     return TissueLabels(LabelMap(grid, labels, numbered), probability, tuple(notes))
 
 

@@ -17,7 +17,7 @@ from dvc.report.labels import label_slices
 from dvc.report.sheet import View
 from mrstrain.options.door import door
 from mrstrain.options.measurement import BoneAndBody, Marks
-from mrstrain.records.inputs import image_stem, output_folder
+from mrstrain.records.inputs import alone, image_stem, output_folder
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.provenance import provenance
 
@@ -69,7 +69,7 @@ def label(
         "label", {"load0": source, **{role: of[0] for role, of in (masks.files | strokes.files).items()}}, {}
     )
     found = {"unsure": made.unsure, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
-    with output_folder(target.parent):
+    with output_folder(target.parent), alone(target, target.with_name(f".{target.name}.lock")):
         write_labels(target, made.labels)
         write_vectors(
             probabilities, image.grid, np.moveaxis(made.probability, 0, -1), names, "probability of each tissue",

@@ -157,9 +157,12 @@ def test_probabilities_are_as_sure_as_they_are_right(labelled) -> None:
     assert 0.05 < made.unsure < 0.3
 
 
-def test_what_does_not_fit_is_refused(labelled) -> None:
+def test_progress_is_told_to_the_end_and_what_does_not_fit_is_refused() -> None:
     grid = heel_grid(3.2)
-    image = scan(Heel(31), grid, snr=25.0, number=0)
+    image, told = scan(Heel(31), grid, snr=25.0, number=0), list[float]()
+    label_tissues(image, labels_of(Heel(31), grid).region("bone"), watch=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
     far = Grid(grid.shape, grid.spacing_mm, grid.origin_mm + 500.0)
     with pytest.raises(GeometryError, match="inside the image"):
         label_tissues(image, Mask(far, np.ones(grid.shape, dtype=bool)))
