@@ -107,10 +107,8 @@ def read_marks(path: Path, names: Path | None) -> LabelMap:
 
 
 def _shown(labels: LabelMap) -> FloatArray:
-    """The lowest point of the first bone, LPS mm; the middle of the body without one."""
-    bones = [name for name in labels.names.values() if is_bones_name(name)]
-    points = labels.region(bones[0]).points() if bones else np.empty((0, 3))
-    if not len(points):
-        points = labels.grid.points(labels.labels > 0)
-        return np.asarray(points[np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1))])
+    """The lowest point of the first bone, or of the body if marks left none of it, LPS mm."""
+    bones = [number for number, name in labels.names.items() if is_bones_name(name)]
+    inside = np.isin(labels.labels, bones[:1])
+    points = labels.grid.points(inside if inside.any() else labels.labels > 0)
     return np.asarray(points[np.argmin(points[:, 2])])

@@ -18,7 +18,7 @@ class BoneAndBody(Options):
     panel: ClassVar[str] = "Inputs"
 
     bone: Path | None = None
-    """Mask of the bone on the unloaded image; the rigid motion of this bone is removed."""
+    """Mask of the bone on the unloaded image."""
     tissue: Path | None = None
     """Mask of the body. Default: found by an intensity threshold."""
 
@@ -37,6 +37,8 @@ class Marks(Options):
 class SubjectFiles(BoneAndBody):
     """What is known of the unloaded image: its bone, body and tissues."""
 
+    bone: Path | None = None
+    """Mask of the bone on the unloaded image; the rigid motion of this bone is removed."""
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
