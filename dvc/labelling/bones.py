@@ -1,22 +1,26 @@
 """Bones: what is bright inside a dark rim, apart from the other tissue."""
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label, median
 from skimage.segmentation import watershed
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 _BLUR_MM = 0.5
-_CORE_MM = 1.2  # from what is dark: gaps in a rim that are narrower do not join bone and soft tissue
-_LEAST_ML = 0.3
+_CORE_MM = 2.5  # from what is dark: gaps in a rim that are narrower than 5 mm do not join bone and soft tissue
+_LEAST_ML = 0.1  # of a core
 _RIM_MM = 1.5  # thickness of a dark rim beyond its darkest part, at most
+_DARK_RIM = (
+    0.6  # brightness of a rim over that of the darker side; .37 to .52 for bones, .8 or more between soft tissues
+)
 
 
 def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: FloatArray) -> IntArray:
     """Bones with bright marrow in soft tissue, numbered from 1; 0 elsewhere, (ni, nj, nk).
 
-    Their cores are the parts, 0.3 mL or more, that a dark rim separates from the largest. From the cores and the
-    largest part, regions grow until they meet in the darkest part of the rim; the bones then get the rest of it.
+    Their cores are parts, 0.1 mL or more, that lie 2.5 mm or more from what is dark. From the cores regions grow until
+    they meet in the darkest places. The largest is the soft tissue; others are bones if the border where they meet
+    their neighbours is dark, and soft tissue if it is not. The bones then get the rest of their rim.
 
     Parameters
     ----------
@@ -35,16 +39,38 @@ def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: Fl
     sizes_ml = np.bincount(parts.ravel(), minlength=count + 1) * float(np.prod(spacing_mm)) / 1000.0
     sizes_ml[0] = 0.0
     large = np.flatnonzero(sizes_ml >= _LEAST_ML)
-    bones = np.zeros(where.shape, dtype=np.int64)
     if large.size < 2:
-        return bones
+        return np.zeros(where.shape, dtype=np.int64)
     numbers = np.zeros(count + 1, dtype=np.int64)
     numbers[large[np.argsort(-sizes_ml[large])]] = np.arange(1, large.size + 1)  # 1 is the soft tissue
     regions = watershed(-blurred, numbers[parts], mask=where)
-    inner = regions > 1
+    dark_rim = _rim_brightness(regions, blurred) < _DARK_RIM
+    dark_rim[:2] = False
+    renumbered = np.where(dark_rim, np.cumsum(dark_rim), 0)
+    inner = dark_rim[regions]
     away, nearest = distance_transform_edt(~inner, sampling=spacing_mm, return_indices=True)
     rim = where & ~lit & (away <= _RIM_MM)
-    bones = np.where(inner | rim, regions[tuple(nearest)] - 1, 0)
+    bones = np.where(inner | rim, renumbered[regions[tuple(nearest)]], 0)
     holes = binary_fill_holes(bones > 0) & where & (bones == 0)
-    bones[holes] = regions[tuple(nearest)][holes] - 1
+    bones[holes] = renumbered[regions[tuple(nearest)]][holes]
     return np.asarray(bones, dtype=np.int64)
+
+
+def _rim_brightness(regions: IntArray, values: Float32Array) -> FloatArray:
+    """Mean brightness where each region meets others, over the median of the darker of the two regions.
+
+    By the number of the region; infinite for one that meets no other.
+    """
+    count = int(regions.max()) + 1
+    usual = np.concatenate([[np.inf], median(values, regions, np.arange(1, count))])
+    total, faces = np.zeros((2, count))
+    for axis in range(regions.ndim):
+        one, other = np.moveaxis(regions, axis, 0)[1:], np.moveaxis(regions, axis, 0)[:-1]
+        at = (one != other) & (one > 0) & (other > 0)
+        lines = np.moveaxis(values, axis, 0)
+        sides = one[at], other[at]
+        shade = np.minimum(lines[1:][at], lines[:-1][at]) / np.minimum(usual[sides[0]], usual[sides[1]])
+        for side in sides:
+            total += np.bincount(side, shade, count)
+            faces += np.bincount(side, minlength=count)
+    return np.where(faces > 0, total / np.maximum(faces, 1), np.inf)

@@ -169,3 +169,25 @@ def test_progress_is_told_to_the_end_and_what_does_not_fit_is_refused() -> None:
     whole = Mask(grid, np.ones(grid.shape, dtype=bool))
     with pytest.raises(InputError, match="no soft tissue"):
         label_tissues(image, whole)
+
+
+@pytest.mark.parametrize("spacing_mm", [(1.2, 1.2, 1.2), (1.0, 1.0, 2.0)])
+def test_bones_are_found_where_slices_are_thick(spacing_mm: tuple[float, float, float]) -> None:
+    heel, grid = Heel(7), heel_grid(spacing_mm)
+    truth = labels_of(heel, grid)
+    made = label_tissues(scan(heel, grid, snr=25.0, number=0), truth.region("bone"))
+    assert dice(made.labels.region("other bone").inside, truth.region("ankle").inside) > 0.9
+
+
+@pytest.mark.parametrize(("between", "bones"), [(0.45, 1), (0.75, 0)])
+def test_what_a_dark_rim_does_not_enclose_is_no_bone(between: float, bones: int) -> None:
+    """A ball in soft tissue, behind a closed layer of 2 mm: as dark as cortical bone, or as a septum."""
+    grid = Grid((40, 40, 40), SPACING, np.full(3, -19.5))
+    radius = np.linalg.norm(grid.points(), axis=-1)
+    values = np.where(np.abs(radius - 9.0) < 1.0, 400.0 * between, 400.0)
+    values += np.random.default_rng(1).normal(0.0, 15.0, values.shape)
+    everywhere = np.ones(grid.shape, dtype=bool)
+    found = bones_in(values.astype(np.float32), everywhere, 0.85 * 400.0, SPACING)
+    assert found.max() == bones
+    if bones:
+        assert dice(found > 0, radius < 10.0) > 0.95
