@@ -159,8 +159,9 @@ SAMPLED = _ARRAYS[:-2]  # with a value for each sample: all but the autocorrelat
 
 
 def measure_run(
-    case: AccuracyCase, worker: Worker, computing: AbstractContextManager[object], progress: Callable[[float], None]
-) -> ErrorSamples:
+    case: AccuracyCase, worker: Worker, computing: AbstractContextManager[object], progress: Callable[[float], None],
+    label: Callable[[Image, Mask], LabelMap] | None = None,
+) -> ErrorSamples:  # fmt: skip
     """Make the image pair of a case, register it and compare the result with the truth.
 
     Parameters
@@ -171,6 +172,9 @@ def measure_run(
         Held while this process itself computes on all cores: a lock, where several cases are measured at once.
     progress : callable
         ``progress(fraction)`` of the registration.
+    label : callable, optional
+        Makes the label map that the registration is given, numbered as `TISSUES`, from the unloaded image and the mask
+        of its bone. By default, it is the phantom's own.
 
     Raises
     ------
@@ -179,6 +183,9 @@ def measure_run(
     """
     with computing:
         reference, loaded, labels, motion = _phantom_pair(case)
+        bone, body = labels.region("bone"), labels.labels > 0
+        if label is not None:
+            labels = label(reference, bone)
     # A wave moves the bone too, so there is nothing to align on.
     align_on = "bone" if case.wavelength_mm is None else "none"
     settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
@@ -187,12 +194,12 @@ def measure_run(
     elif case.keeps_volume:
         settings = replace(settings, engine=settings.engine.keeping_volume())
     registration = register(
-        reference, loaded, bone=labels.region("bone"), tissue=Mask(labels.grid, labels.labels > 0), labels=labels,
+        reference, loaded, bone=bone, tissue=Mask(labels.grid, labels.labels > 0), labels=labels,
         settings=settings, worker=worker,
         progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),
     )  # fmt: skip
     with computing:
-        return _sampled_errors(case, labels, motion, registration)
+        return _sampled_errors(case, labels, body, motion, registration)
 
 
 def _phantom_pair(case: AccuracyCase) -> tuple[Image, Image, LabelMap, Motion | None]:
@@ -210,12 +217,12 @@ def _phantom_pair(case: AccuracyCase) -> tuple[Image, Image, LabelMap, Motion | 
 
 
 def _sampled_errors(
-    case: AccuracyCase, labels: LabelMap, motion: Motion | None, registration: Registration
+    case: AccuracyCase, labels: LabelMap, body: BoolArray, motion: Motion | None, registration: Registration
 ) -> ErrorSamples:
-    """Measured against true displacement and strain, in one of eight voxels of the body."""
+    """Measured against true displacement and strain, in one of eight labelled voxels of the body."""
     sampled = np.zeros(labels.grid.shape, dtype=bool)
     sampled[::_STRIDE, ::_STRIDE, ::_STRIDE] = True
-    sampled &= labels.labels > 0
+    sampled &= body & (labels.labels > 0)
     u, H = evaluate_on_grid(registration.displacement, labels.grid, sampled)
     X = labels.grid.points(sampled)
     edge_mm = float(registration.displacement.spacing_mm.min())

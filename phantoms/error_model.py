@@ -71,15 +71,20 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
     return ErrorModel(Path(presets.pop()).name, digest, tables, source)
 
 
-def coverage_rows(runs: Sequence[ErrorSamples]) -> list[CoverageRow]:
-    """Coverage of the error model by cross-validation: each heel is compared with a model fitted to all other heels.
+def coverage_rows(runs: Sequence[ErrorSamples], model: ErrorModel | None = None) -> list[CoverageRow]:
+    """Coverage of an error model on these runs.
 
-    Motions are the same in both. Conditions with a single heel have no rows.
+    By default by cross-validation: each heel is compared with a model fitted to all other heels. Motions are the same
+    in both, and conditions with a single heel have no rows.
     """
     rows = []
     for condition, some in by_condition([r for r in runs if r.case.wavelength_mm is None]):
-        validations = _validations(some)
-        factor = _widening(validations)
+        if model is None:
+            validations = _validations(some)
+            factor = _widening(validations)
+        else:
+            table = model.table_for(np.array(some[0].case.spacing_mm), some[0].estimated_snr)
+            validations, factor = [_validated(run, tissue, table) for run, tissue in _large(some)], table.factor
         for motion, tissue in dict.fromkeys((v.motion, v.tissue) for v in validations):
             mine = [v for v in validations if (v.motion, v.tissue) == (motion, tissue)]
             within = float(np.concatenate([v.within for v in mine]).mean())
@@ -106,8 +111,12 @@ def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:
     if len(seeds) < 2:
         return []
     tables = {seed: _table([r for r in runs if r.case.seed != seed]) for seed in seeds}
-    large = [(r, tissue) for r in runs for tissue in SOFT if np.count_nonzero(of_tissue(r.tissue, tissue)) >= _FEW]
-    return [_validated(run, tissue, tables[run.case.seed]) for run, tissue in large]
+    return [_validated(run, tissue, tables[run.case.seed]) for run, tissue in _large(runs)]
+
+
+def _large(runs: Sequence[ErrorSamples]) -> list[tuple[ErrorSamples, str]]:
+    """The soft tissues of each run that have enough samples."""
+    return [(r, tissue) for r in runs for tissue in SOFT if np.count_nonzero(of_tissue(r.tissue, tissue)) >= _FEW]
 
 
 def _widening(validations: Sequence[_Validation]) -> float:

@@ -181,6 +181,15 @@ def test_coverage_judges_each_heel_by_the_others() -> None:
     assert coverage_rows(alike[:1]) == []
 
 
+def test_coverage_of_a_given_error_model() -> None:
+    seen = [samples(replace(CASE, seed=s), sd=0.02, count=20_000) for s in (1, 2, 3)]
+    model, new = fit_error_model(seen, "", ""), replace(CASE, seed=4)
+    (alike,) = (r for r in coverage_rows([samples(new, sd=0.02, count=20_000)], model) if r.tissue == "fat")
+    assert alike.voxels_within == pytest.approx(0.95, abs=0.02)
+    (noisier,) = (r for r in coverage_rows([samples(new, sd=0.06, count=20_000)], model) if r.tissue == "fat")
+    assert noisier.voxels_within < 0.6
+
+
 def test_samples_survive_their_file_and_a_damaged_one_is_made_anew(tmp_path: Path) -> None:
     path, made = tmp_path / "run.npz", samples(CASE)
     made.write(path, "key")
