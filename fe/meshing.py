@@ -74,6 +74,8 @@ def check_meshing(
         raise InputError(f"The finer edge length must be between 0 and {edge_mm} mm; got {finer[1]} mm.")
     there = set(np.unique(labels.labels).tolist())
     numbers = {name: number for number, name in labels.names.items() if number in there}
+    if not bones:
+        raise labels.no_region("bone")
     for name in (*bones, *((finer[0],) if finer else ())):
         if name not in numbers:
             raise labels.no_region(name)

@@ -1,5 +1,6 @@
 """What a measurement is made from, how a registration is judged, and what is written of it beside the maps."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -101,16 +102,19 @@ def carried_images(found: Registration) -> CarriedImages:
     return CarriedImages(aligned, registered, local_rigid, local_after, similarity)
 
 
-def quality_of(found: Registration, maps: StrainMaps, similarity: Similarity, evidence: Evidence) -> Quality:
-    """Quality and verdict of a registration."""
+def quality_of(
+    found: Registration, maps: StrainMaps, similarity: Similarity, evidence: Evidence, doubts: Sequence[str] = ()
+) -> Quality:
+    """Quality and verdict of a registration; with ``doubts`` about what it was made from, "Use with care" at best."""
     points, floor, choice = evidence.landmarks, evidence.noise_floor, found.choice
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if points is None else target_registration_error(found.total, *points)
     quality = assess(
         maps, found.tissue, bone, similarity=similarity, landmark_errors_mm=errors, floor=floor, in_bone=choice.in_bone
     )
-    doubts = [Verdict("caution", (found.bone_doubt,))] if found.bone_doubt else []
-    return replace(quality, verdict=with_caution(together([quality.verdict, *doubts]), choice))
+    every = [*([found.bone_doubt] if found.bone_doubt else []), *doubts]
+    cautions = [Verdict("caution", (doubt,)) for doubt in every]
+    return replace(quality, verdict=with_caution(together([quality.verdict, *cautions]), choice))
 
 
 def with_caution(verdict: Verdict, choice: Regularisation) -> Verdict:

@@ -121,7 +121,9 @@ class Measurement:
             images = carried.result()
         if is_repeat:
             more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
-        quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
+        doubts = () if subject.from_image is None else subject.from_image.doubts
+        quality = judgement.quality_of(found, maps, images.similarity, more, doubts)
+        alignment = judgement.alignment_of(found)
         regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
         source, at = Source(subject, found.tissue, found, images), subject.lowest_bone_point_mm
         figures = found.deformation, maps, alignment, quality, regions, bars, found.reference, source, at, is_repeat
@@ -312,17 +314,17 @@ class Measurement:
         found, bars = None if self.source is None else self.source.registration, self.error_bars
         weights = [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
         engine = "" if found is None else found.settings.engine.note
+        made = None if self.source is None else self.source.subject.from_image
         fixed = page.FIXED_WEIGHTS if weights and self.is_repeat else ""
-        notes = " ".join(filter(None, [engine, fixed, *self._of_error_bars]))
+        notes = " ".join(filter(None, [engine, "" if made is None else made.told, fixed, *self._of_error_bars]))
         tables = [replace(page.key_figures(self.quality, self.alignment), note=notes), page.region_table(self.regions)]
         tables += [] if self.is_repeat else weights
         tables += page.error_tables(bars)
         first = [pictures[stem] for stem in ("strain", "curves")]
         others = [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
         short = page.summary_table(self.regions, self.intervals)
-        return Section(
-            self.name, self.verdict, tuple(tables), (*first, *others), pictures_first=True, summary=short
-        )  # fmt: skip
+        pictured = (*first, *others)
+        return Section(self.name, self.verdict, tuple(tables), pictured, pictures_first=True, summary=short)
 
     def drawings(self) -> dict[str, Drawing]:
         """The figures of a report, by the name of their files; InputError for one that was read from a folder."""

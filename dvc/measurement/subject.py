@@ -19,7 +19,40 @@ _BONES = {
     "femur", "trochanter", "patella", "pelvis", "sacrum", "coccyx", "ilium", "ischium", "pubis", "vertebra",
 }  # fmt: skip
 _SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
+_HEEL = ("bone", "calcaneus")
 _INFERIOR = (0.0, 0.0, -1.0)
+_MOST_UNSURE = 0.2  # of the voxels; .11 to .16 on the phantoms for which error bars were found to hold
+
+
+@dataclass(frozen=True, slots=True)
+class LabelsFromImage:
+    """How a label map came out that was made from the image (`label_tissues`).
+
+    Attributes
+    ----------
+    unsure : float
+        Share of the labelled voxels whose tissue has a probability below 0.9.
+    notes : tuple of str
+        What was not found, and why.
+    """
+
+    unsure: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def told(self) -> str:
+        """A sentence on it."""
+        return f"The label map was made from the image; {100 * self.unsure:.0f} % of its voxels are unsure."
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why a result that relies on these labels needs care; empty where it does not."""
+        notes = tuple(f"The label map was made from the image. {note}" for note in self.notes)
+        if self.unsure <= _MOST_UNSURE:
+            return notes
+        limits = f"use with care above {100 * _MOST_UNSURE:.0f} %"
+        correct = "Look at its picture, and correct it with marks or by hand."
+        return (*notes, f"{self.told.removesuffix('.')} ({limits}). {correct}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +69,8 @@ class Subject:
         Columns: plate normal, shear direction, and their cross product; None without a shear direction.
     files : dict
         Role to the file it came from, for provenance; empty where arrays were given.
+    from_image : LabelsFromImage or None
+        How the labels came out if they were made from the image; None for others.
     """
 
     reference: Image
@@ -46,6 +81,7 @@ class Subject:
     plate_normal: FloatArray = field(default_factory=lambda: np.array(_INFERIOR))
     axes: FloatArray | None = None
     files: dict[str, Path] = field(default_factory=dict)
+    from_image: LabelsFromImage | None = None
 
     @property
     def lowest_bone_point_mm(self) -> FloatArray | None:
@@ -87,6 +123,26 @@ def _unit(name: str, vector: Sequence[float]) -> FloatArray:
         told = f"{name} (--{name.replace('_', '-')} on the command line)"
         raise InputError(f"{told} must be three finite numbers (LPS), not all zero; got {list(vector)}.")
     return direction / length
+
+
+def bones_of(labels: LabelMap, given: Sequence[str] = ()) -> tuple[str, ...]:
+    """The labels that are bones: those given, or those with voxels that are named like one.
+
+    Of those named like one, "bone" or "calcaneus" is the first. Without any: "bone" if a label has no name, since it
+    may be one; none otherwise.
+
+    >>> from dvc import Grid
+    >>> grid = Grid((3, 1, 1), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    >>> bones_of(LabelMap(grid, np.array([[[1]], [[2]], [[3]]]), {1: "fat", 2: "talus", 3: "bone", 4: "tibia"}))
+    ('bone', 'talus')
+    """
+    if given:
+        return tuple(given)
+    there = set(np.unique(labels.labels).tolist())
+    names = [name for number, name in labels.names.items() if number in there and is_bones_name(name)]
+    if not names and any(name.startswith("label-") for name in labels.names.values()):
+        return ("bone",)
+    return tuple(sorted(names, key=lambda name: name.casefold() not in _HEEL))
 
 
 def is_bones_name(name: str) -> bool:

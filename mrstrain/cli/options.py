@@ -41,7 +41,7 @@ EXAMPLES = {
         "cohort": "subject01 subject02 --out cohort",
         "demo": "--out demo",
         "label": "Load0.nii.gz --bone calcaneus.nii.gz --out tissues.nii.gz",
-        "register": "Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --out results",
+        "register": "Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --labels auto --out results",
         "strain": "Load0.nii.gz TransformParameters.1.txt --bone calcaneus.nii.gz --out strained",
         "phantom": "--load Load1 --spacing 1.2 --out heel",
         "twin": "Load0.nii.gz TransformParameters.1.txt --bone calcaneus.nii.gz --out twin",

@@ -12,11 +12,11 @@ from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
-from dvc.measurement.subject import is_bones_name
+from dvc.measurement.subject import bones_of
 from dvc.report.page import Section
 from dvc.threads import usable_cores
 from dvc.worker import side_by_side
-from fe import BONE, read_tet_mesh
+from fe import read_tet_mesh
 from mrstrain.comparison.from_record import fill_directions, fill_labels, taken_from_record
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, model_files
@@ -92,12 +92,10 @@ def compare(
     for line in taken:  # now, so that a wrong file is noticed before an hour is spent on it
         tell(NOTE, line, 0.0)
     tissues = read_labels(labelling.labels, labelling.names)
-    bones = labelling.bones or _usual_bones(tissues)
+    bones = bones_of(tissues, labelling.bones)
     if not bones:
-        names = ", ".join(tissues.names.values())
-        tell(
-            NOTE, f"No label is called bone: {names} are compared as soft tissue. Name a bone among them (--bone).", 0.0
-        )
+        names, name = ", ".join(tissues.names.values()), "Name a bone among them (--bone)."
+        tell(NOTE, f"No label is named like a bone: {names} are compared as soft tissue. {name}", 0.0)
     thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
     criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     pairs = {load: (of.plate_normal, of.shear_direction) for load, of in of_load.items()} | dict(towards or {})
@@ -141,13 +139,6 @@ def compare(
             parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
     share(1.0)
     return Compared(target, result, *parts, taken)
-
-
-def _usual_bones(labels: LabelMap) -> tuple[str, ...]:
-    """The bone of a label map where none is named: "bone", or none where the name of every label is of soft tissue."""
-    names = labels.names.values()
-    unclear = BONE in names or any(is_bones_name(name) or name.startswith("label-") for name in names)
-    return (BONE,) if unclear else ()
 
 
 def _at_once(loads: int) -> int:

@@ -26,6 +26,8 @@ _PAPERS = {
     "56(3):221-255, 2004. doi:10.1023/B:VISI.0000011205.11775.fd",
     "Lowekamp 2013": "Lowekamp BC, Chen DT, Ibáñez L, Blezek D. The design of SimpleITK. Front Neuroinform 7:45, 2013. "
     "doi:10.3389/fninf.2013.00045",
+    "Chambolle 2005": "Chambolle A. Total variation minimization and a class of binary MRF models. Energy Minimization "
+    "Methods in Computer Vision and Pattern Recognition, LNCS 3757:136-152, 2005. doi:10.1007/11585978_10",
     "Tustison 2010": "Tustison NJ, Avants BB, Cook PA, Zheng Y, Egan A, Yushkevich PA, Gee JC. N4ITK: improved N3 bias "
     "correction. IEEE Trans Med Imaging 29(6):1310-1320, 2010. doi:10.1109/TMI.2010.2046908",
     "Hu 2020": "Hu Y, Schneider T, Wang B, Zorin D, Panozzo D. Fast tetrahedral meshing in the wild. ACM Trans Graph "
@@ -108,7 +110,17 @@ def _registration(record: Record) -> str:
     return (
         f"The loaded image was{before or ', without rigid alignment,'} registered non-rigidly {how}; seed "
         f"{parameters.get('seed')}. The bias field had been removed from both images (N4, Tustison 2010)."
+        f"{_labels(parameters.get('labels_from_image'))}"
     )
+
+
+def _labels(made: Mapping[str, Any] | None) -> str:
+    """How the label map was made if that is known: a sentence after a space, or nothing."""
+    if not made:
+        return ""
+    how = "from the unloaded image by mrstrain: skin by a layer model of the brightness below the surface, bones by a"
+    unsure = f"{100.0 * made['unsure']:.0f} % of its voxels had a probability below 90 %"
+    return f" The label map was made {how} watershed, and fat and muscle by total variation (Chambolle 2005); {unsure}."
 
 
 def _files(record: Record) -> str:

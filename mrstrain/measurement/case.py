@@ -1,7 +1,7 @@
 """Loads that were measured and written: each a case, together a series with its report."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -90,12 +90,16 @@ class Series:
     failures: dict[str, str]
 
     @classmethod
-    def of(cls, out: Path, cases: tuple[Case, ...], failures: dict[str, str], record: Mapping[str, object]) -> Self:
-        """Write the provenance of a series and its report, one self-contained page."""
+    def of(
+        cls, out: Path, cases: tuple[Case, ...], failures: dict[str, str], record: Mapping[str, object],
+        more: Sequence[Section] = (),
+    ) -> Self:  # fmt: skip
+        """Write the provenance of a series and its report, one self-contained page with ``more`` at its end."""
         told = [case.section for case in cases]
         told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]
         verdict = worst([s.verdict.among(s.title) if told[1:] else s.verdict for s in told if s.verdict is not None])
         write_json(out / PROVENANCE, record)
+        told += [replace(section, folded=True) for section in more]
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
         title, about = "Strain from MR image pairs", _images(record, cases)
         write_report(out / REPORT, title, verdict, told, closing, record_lines(record), notes=about)

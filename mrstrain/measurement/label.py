@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,24 +12,33 @@ from dvc.arrays import FloatArray
 from dvc.atomic_files import write_json
 from dvc.errors import InputError, OutputError
 from dvc.measurement.subject import is_bones_name
-from dvc.report.drawing import ENDINGS, save_figure
+from dvc.report.drawing import ENDINGS, Drawing
 from dvc.report.labels import label_slices
+from dvc.report.page import Section, Table
 from dvc.report.sheet import View
 from mrstrain.options.door import door
 from mrstrain.options.measurement import BoneAndBody, Marks
 from mrstrain.records.inputs import alone, image_stem, output_folder
 from mrstrain.records.outcome import Outcome
-from mrstrain.records.provenance import provenance
+from mrstrain.records.provenance import file_hash, provenance
 
 _WRITTEN = (".nii.gz", ".nii", ".nrrd", ".mha")
 _USUAL = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon"}  # marks without names
+
+
+@dataclass(frozen=True, slots=True)
+class Labelled(Outcome):
+    """The label map that was made: what is told of it in a line, and its section of a report."""
+
+    headline: str = field(kw_only=True)
+    section: Section = field(kw_only=True)
 
 
 @door
 def label(
     load0: Path | str, *, out: Path | str, masks: BoneAndBody, strokes: Marks,
     watch: Callable[[float], None] | None = None,
-) -> Outcome:  # fmt: skip
+) -> Labelled:  # fmt: skip
     """Label skin, fat, muscle and other bones of an unloaded image.
 
     Parameters
@@ -76,20 +85,20 @@ def label(
             frame="invariant", unit="1",
         )  # fmt: skip
         view = View.through(image.grid, _shown(made.labels), made.labels.labels > 0)
-        save_figure(stem, label_slices(view, image, made.labels, made.probability))
-        write_json(beside[1], record | found)
+        drawing = Drawing.of("Tissues and their probability", label_slices, view, image, made.labels, made.probability)
+        picture = drawing.save(stem)
+        write_json(beside[1], record | found | {"labels_sha256": file_hash(target)})
     voxel_ml = image.grid.voxel_volume_mm3 / 1000.0
-    volumes = ", ".join(
-        f"{name} {np.count_nonzero(made.labels.labels == number) * voxel_ml:.1f}"
-        for number, name in made.labels.names.items()
+    counts = {name: np.count_nonzero(made.labels.labels == number) for number, name in made.labels.names.items()}
+    volumes = {name: float(count * voxel_ml) for name, count in counts.items()}
+    unsure = f"{100 * made.unsure:.0f} % of the voxels are unsure (probability below 90 %)"
+    told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
+    lines = (told, f"{unsure}; {beside[-len(ENDINGS)]} shows where.", *made.notes, f"Label map: {target}")
+    table = Table("Volumes", ("tissue", "volume, mL"), tuple(volumes.items()))
+    section = Section(
+        "Label map made from the image", None, (table,), (picture,), (f"{unsure}.", *made.notes), pictures_first=True
     )
-    lines = (
-        f"Volumes, mL: {volumes}",
-        f"{made.unsure:.0%} of the voxels are unsure (probability below 90 %); {beside[-len(ENDINGS)]} shows where.",
-        *made.notes,
-        f"Label map: {target}",
-    )
-    return Outcome(target, lines)
+    return Labelled(target, lines, headline=f"{', '.join(volumes)}; {unsure}", section=section)
 
 
 def read_marks(path: Path, names: Path | None) -> LabelMap:

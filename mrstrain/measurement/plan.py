@@ -1,7 +1,7 @@
 """How the loads of a subject are measured, in a series or by a worker of a study, and checked by their twins."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from threading import Thread
 
@@ -71,6 +71,7 @@ def record_of(
     parameters = {
         "align": settings.align_on, "seed": settings.seed, "threads": settings.threads,
         "plate_normal_lps": subject.plate_normal.tolist(), "engine": settings.engine.family,
+        "labels_from_image": None if subject.from_image is None else asdict(subject.from_image),
         **settings.engine.record(), **{name: of for name, of in how.plain().items() if name not in _SETTINGS}, **more,
     }  # fmt: skip
     given: _Files = {**subject.files, **files, "error_model": how.files.get("error_model", [])}

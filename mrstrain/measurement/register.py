@@ -16,19 +16,30 @@ from dvc.io.result_folder import QUALITY, REPEAT, spline_in
 from dvc.registration.align import align as align_images, without_motion
 from dvc.registration.engines import DEFAULT
 from dvc.registration.register import refuse_one_image_twice
+from dvc.report.page import Section
 from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
+from mrstrain.measurement.label import label
 from mrstrain.measurement.plan import Plan, record_of
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
-from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
+from mrstrain.options.measurement import (
+    AUTO,
+    MADE_LABELS,
+    MeshAndAxes,
+    RegistrationOptions,
+    Running,
+    Scans,
+    SubjectFiles,
+)
 from mrstrain.options.model import Flag
 from mrstrain.records.inputs import (
     alone,
     case_names,
+    made_labels,
     output_folder,
     read_subject,
     refuse_small_disk,
@@ -57,6 +68,8 @@ def register(
         Unloaded image (reference configuration).
     loads : paths
         Loaded images. Each gets a folder in ``out`` named after its file.
+    subject_files
+        With labels "auto", `label` makes the label map first, in the folder ``labels`` of ``out``.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
     worker : Worker, optional
@@ -74,8 +87,10 @@ def register(
     _check_start(scans, chosen)
     given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
     refuse_touching_inputs(target, cases, [load0, *paths, *given])
-    align = registration.align
-    if align == "bone" and subject_files.bone is None and subject_files.bone_label is None:
+    align, tell = registration.align, progress or (lambda *_: None)
+    if subject_files.labels == AUTO:
+        _check_auto(subject_files, cases, scans)
+    elif align == "bone" and subject_files.bone is None and subject_files.bone_label is None:
         if subject_files.labels is not None:
             raise InputError(
                 "The images are aligned on a rigid bone, and none is given.\n"
@@ -90,6 +105,10 @@ def register(
     at_once, threads = running.shares(1 if registration.chain else len(cases))
     with nullcontext(worker) if worker else Worker(threads) as first:
         first.start(align_images.__module__, type(chosen).__module__)
+        if subject_files.labels == AUTO:
+            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
+        else:
+            of_labels = ()
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
         # Read now: what is wrong with it must not be found after an hour.
@@ -112,11 +131,34 @@ def register(
         more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}
         record = record_of(subject, files, settings, registration, more)
         plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
-        run = _Run(target, plan, images, start, progress or (lambda *_: None))
+        run = _Run(target, plan, images, start, tell)
         with output_folder(target), alone(target):
             run.all(at_once, registration.chain, first)
             finished = run.finished()
-    return Series.of(target, finished, run.failures, record)
+    return Series.of(target, finished, run.failures, record, of_labels)
+
+
+def _check_auto(files: SubjectFiles, cases: Sequence[str], scans: Scans) -> None:
+    """InputError if the label map cannot be made from the image."""
+    if files.bone is None:
+        raise InputError("With labels auto (--labels auto), give the mask of the bone, bone (--bone).")
+    if files.names is not None or files.bone_label is not None:
+        raise InputError("names and bone_label are for a label map of your own, not for labels auto (--labels auto).")
+    if scans.allow_missing:
+        raise InputError("labels auto needs an image without missing voxels: not together with allow_missing.")
+    folder = Path(MADE_LABELS).parts[0]
+    if folder in map(one_spelling, cases):
+        raise InputError(f"A loaded image is named '{folder}', as the folder of the label map; rename it.")
+
+
+def _labelled(
+    load0: Path, files: SubjectFiles, out: Path, tell: Callable[[float], None]
+) -> tuple[SubjectFiles, tuple[Section, ...]]:
+    """Make the label map; the files with it, and its section of the report."""
+    labels, names = made_labels(out)
+    tell(0.0)
+    made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, watch=tell)
+    return files.model_copy(update={"labels": labels, "names": names}), (made.section,)
 
 
 class InSeries(Running):

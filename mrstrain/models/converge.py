@@ -9,6 +9,7 @@ import numpy as np
 from dvc import read_labels
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
+from dvc.measurement.subject import bones_of
 from dvc.own_files import read_json
 from dvc.report.drawing import figure_files, save_figure
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
@@ -88,14 +89,15 @@ def converge(
     refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], [Path(labels), *labelling.paths])
     make_output(target)
     tell, region, material = progress or (lambda *_: None), followed.region, followed.material
-    known = list(read_labels(labels, labelling.names).names.values())
-    if region not in known or region in labelling.bones:
+    tissues = read_labels(labels, labelling.names)
+    known, bones = list(tissues.names.values()), bones_of(tissues, labelling.bones)
+    if region not in known or region in bones:
         raise InputError(f"The label map has no soft tissue '{region}'; it has {', '.join(known)}.")
     # an unsuitable material set is refused before hours of meshing
-    material_set(material).for_regions([name for name in known if name not in labelling.bones])
+    material_set(material).for_regions([name for name in known if name not in bones])
     places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
     for edge, place in places.items():
-        if not _is_of(place, inputs, labelling.bones):
+        if not _is_of(place, inputs, bones):
             make_mesh.with_options(
                 labels, out=place, labelling=labelling, meshing=options.Meshing(edge_mm=edge),
                 watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dvc import TetMesh, read_labels
 from dvc.errors import InputError, OutputError
-from dvc.measurement.subject import is_bones_name
+from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.report.drawing import ENDINGS, save_figure
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
@@ -92,9 +92,10 @@ def mesh(
     given = read_labels(labels, labelling.names)
     with output_folder(target.parent), alone(target, target.with_name(f".{target.name}.lock")):
         how = meshing.model_dump()
-        made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch or (lambda _: None))
+        bones = bones_of(given, labelling.bones)
+        made, quality = mesh_labels(given, **how, bones=bones, watch=watch or (lambda _: None))
         del how["limit_s"]  # does not affect the mesh
-        record = provenance("mesh", files, how | {"bones": list(labelling.bones)})
+        record = provenance("mesh", files, how | {"bones": list(bones)})
         write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     save_figure(target.with_suffix(""), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
     return Meshed(target, made, quality)

@@ -8,6 +8,10 @@ from pydantic import AfterValidator
 from dvc.threads import usable_cores
 from mrstrain.options.model import Cli, Count, Flag, NotNegative, Options, Positive, Vector
 
+AUTO = Path("auto")
+"""In place of a label map: it is made from the image."""
+MADE_LABELS = "labels/tissues.nii.gz"
+"""The label map that is made, in the folder of the results."""
 Frame = Literal["LPS", "RAS"]
 Unit = Literal["mm", "m"]
 
@@ -42,7 +46,7 @@ class SubjectFiles(BoneAndBody):
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
-    """Label map of the tissues on the unloaded image."""
+    """Label map of the tissues on the unloaded image. register takes auto: made from the image and --bone."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
 from mrstrain.options.measurement import Frame, Unit
 from mrstrain.options.model import Cli, Flag, Names, NotNegative, Options, Positive, Real, Vector
@@ -22,9 +22,9 @@ class Labelling(Options):
 
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
-    bones: Annotated[Names, Field(min_length=1), Cli("--bone")] = ("bone",)
-    """Name of a bone label. Bones are cut out of the mesh and their surfaces are fixed; slices in figures go through
-    the lowest point of the first bone."""
+    bones: Annotated[Names, Cli("--bone")] = ()
+    """Name of a bone label. Bones are cut out of the mesh and their surfaces are fixed. Default: every label that is
+    named like a bone, such as bone, calcaneus or talus."""
 
 
 class ComparisonLabels(Options):
@@ -38,7 +38,7 @@ class ComparisonLabels(Options):
     """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, without --labels."""
     bones: Annotated[Names, Cli("--bone")] = ()
     """Name of a bone label, which is not compared; slices in figures go through the lowest point of the first bone.
-    Default: the bone label of the measurement, without --labels; else bone, if any label is of bone."""
+    Default: the bone label of the measurement, without --labels; else every label that is named like a bone."""
 
 
 class Finer(NamedTuple):

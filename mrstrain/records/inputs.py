@@ -15,8 +15,10 @@ from dvc.errors import InputError, OutputError
 from dvc.file_names import clash, refuse_as_file_name
 from dvc.io.images.write import refuse_overwriting_inputs
 from dvc.io.result_folder import REPORT
-from dvc.measurement.subject import plate_directions
-from mrstrain.options.measurement import MeshAndAxes, SubjectFiles
+from dvc.measurement.subject import LabelsFromImage, plate_directions
+from dvc.own_files import read_json
+from mrstrain.options.measurement import AUTO, MADE_LABELS, MeshAndAxes, SubjectFiles
+from mrstrain.records.provenance import file_hash
 
 _LOCK = ".mrstrain-lock"
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
@@ -28,6 +30,8 @@ def read_subject(
     """Read the unloaded image, its masks, labels and mesh; refuse what does not fit together."""
     reference, onto = read_image(load0, allow_missing=allow_missing), onto or MeshAndAxes()
     label_map, mesh = None, None
+    if files.labels == AUTO:
+        raise InputError("Only register and run make a label map from the image. Make it with `mrstrain label` first.")
     if files.labels is not None:
         label_map = fit_mask(read_labels(files.labels, files.names), reference.grid, str(files.labels))
     elif files.names is not None or files.bone_label is not None:
@@ -49,7 +53,25 @@ def read_subject(
             )
     normal, axes = plate_directions(onto.plate_normal, onto.shear_direction)
     given = {role: paths[0] for role, paths in {"load0": [Path(load0)], **files.files, **onto.files}.items()}
-    return Subject(reference, bone, tissue, label_map, mesh, normal, axes, given)
+    made = None if files.labels is None else made_from_image(files.labels)
+    return Subject(reference, bone, tissue, label_map, mesh, normal, axes, given, made)
+
+
+def made_labels(out: Path) -> tuple[Path, Path]:
+    """The label map that is made from the image, in a folder of results, and the table of its names."""
+    labels = out / MADE_LABELS
+    return labels, labels.with_name(image_stem(labels.name) + ".csv")
+
+
+def made_from_image(labels: Path) -> LabelsFromImage | None:
+    """How a label map that `label` made came out, by the record beside it; None for any other, or one changed since."""
+    try:
+        record = read_json(labels.with_name(image_stem(labels.name) + ".json"))
+        if record["command"] != "label" or record["labels_sha256"] != file_hash(labels):
+            return None
+        return LabelsFromImage(float(record["unsure"]), tuple(map(str, record["notes"])))
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
 
 
 def read_matrix(path: Path) -> FloatArray:

@@ -11,10 +11,11 @@ import numpy as np
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
 from dvc.errors import MrstrainError
 from dvc.io.result_folder import REPEAT
-from dvc.measurement.subject import is_bones_name
+from dvc.labelling.tissues import NAMES
+from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
-from fe import MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
+from fe import BONE, MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.modelling import ModelReading
@@ -113,18 +114,20 @@ class _Look:
     def at_shared(self) -> tuple[Image | None, LabelMap | None]:
         """Check everything except loaded images; return the unloaded image, and the labels on its grid."""
         study, asked = self.study, self.asked
-        reference = self.tried(self.image, study.images.load0) if asked("register", "level") else None
+        reference = self.tried(self.image, study.images.load0) if asked("label", "register", "level") else None
         if reference is not None:
             self.notes.append(f"Load0: {reference.grid}")
-        labels = self.labels(reference) if asked("register", "level", "compare") else None
+        labels = self.labels(reference) if asked("label", "register", "level", "compare") else None
         every = asked("simulate", "drive", "compare")
         own = [study.directions[load] for load in study.loads if every or asked(f"register {load}")]
         for normal, shear in dict.fromkeys(own):
             self.tried(plate_axes, -np.asarray(normal), shear)
+        self.at_masks(reference)
         if asked("register", "level"):
-            self.at_registration(reference, labels)
+            self.at_registration(labels)
         if study.models.sets and asked("mesh", "simulate", "drive"):
-            to_mesh = None if study.mesh.file else self.tried(read_labels, *labels_to_mesh(study))
+            made_later = study.mesh.file or (study.makes_labels and study.mesh.labels is None)
+            to_mesh = None if made_later else self.tried(read_labels, *labels_to_mesh(study))
             if asked("mesh") and to_mesh is not None:
                 self.at_meshing(to_mesh)
             if asked("simulate", "drive"):
@@ -133,7 +136,7 @@ class _Look:
             self.wrong.append("[models] level = true needs an unloaded image without NaN or infinite voxels.")
         if asked("compare"):
             if labels is not None and (study.models.sets or study.models.results):
-                self.tried_at("mesh", "bones", check_bones, labels, study.mesh.bones)
+                self.tried_at("mesh", "bones", check_bones, labels, bones_of(labels, study.mesh.bones))
             if study.compare.thresholds is not None:
                 self.tried(read_thresholds, study.path(study.compare.thresholds))
         return reference, labels
@@ -143,14 +146,30 @@ class _Look:
         return read_image(self.study.path(given), allow_missing=self.study.images.allow_missing)
 
     def labels(self, reference: Image | None) -> LabelMap | None:
-        """The labels, on the unloaded image's grid."""
-        images, path = self.study.images, self.study.path
-        labels = self.tried(read_labels, path(images.labels), self.study.optional_path(images.names))
+        """The labels, on the unloaded image's grid; None if they are to be made from the image."""
+        if self.study.makes_labels:
+            self.notes.append("Labels: made from the image")
+            self.at_marks(reference)
+            return None
+        labels = self.tried(read_labels, *self.study.labels)
         if labels is not None:
             self.notes.append(f"Labels: {', '.join(labels.names.values())}")
             if reference is not None:
-                labels = self.tried(fit_mask, labels, reference.grid, str(images.labels)) or labels
+                labels = self.tried(fit_mask, labels, reference.grid, str(self.study.images.labels)) or labels
         return labels
+
+    def at_marks(self, reference: Image | None) -> None:
+        """Check the marks for the label map, among which the bone must be if there is no mask of it."""
+        from mrstrain.measurement.label import read_marks  # it draws, and matplotlib takes half a second
+
+        images = self.study.images.located(self.study.place)
+        marks = None if images.marks is None else self.tried(read_marks, images.marks, images.mark_names)
+        if marks is None:
+            return
+        if images.bone is None and self.study.bone is not None:
+            self.tried_at("images", "bone", marks.region, self.study.bone)
+        if reference is not None:
+            self.tried(fit_mask, marks, reference.grid, str(images.marks))
 
     def at_loaded(self, reference: Image | None) -> None:
         """Check the loaded images and the repeat scan."""
@@ -170,14 +189,18 @@ class _Look:
             if twin != name:
                 self.wrong.append(f"{name} is identical to the image of {twin} (all voxels are equal).")
 
-    def at_registration(self, reference: Image | None, labels: LabelMap | None) -> None:
-        """Check bone and masks, engine, parameters and error model."""
-        subject, how = self.study.subject_files, self.study.registration.located(self.study.place)
-        if subject.bone_label is not None and labels is not None:
-            self.tried_at("images", "bone", labels.region, subject.bone_label)
+    def at_masks(self, reference: Image | None) -> None:
+        """Check the masks of the bone and the body, if the unloaded image is read."""
+        subject = self.study.subject_files
         for mask in (subject.bone, subject.tissue):
             if mask is not None and reference is not None:
                 self.tried(read_mask, mask, reference.grid)
+
+    def at_registration(self, labels: LabelMap | None) -> None:
+        """Check the label of the bone, engine, parameters and error model."""
+        subject, how = self.study.subject_files, self.study.registration.located(self.study.place)
+        if subject.bone_label is not None and labels is not None:
+            self.tried_at("images", "bone", labels.region, subject.bone_label)
         engine = self.tried(engine_of, how, labelled=True)
         if engine is None:
             return
@@ -195,8 +218,11 @@ class _Look:
 
     def at_meshing(self, labels: LabelMap) -> None:
         """Report problems of a label map for `mesh`, and bones that would be meshed."""
-        how = self.study.mesh
-        self.tried(check_meshing, labels, how.edge_mm, how.bones, how.finer)
+        how, bones = self.study.mesh, bones_of(labels, self.study.mesh.bones)
+        if bones:
+            self.tried(check_meshing, labels, how.edge_mm, bones, how.finer)
+        else:
+            self.wrong.append(f"{self.study.at('mesh', 'bones')}: {labels.no_region(BONE)}")
         self.notes += [
             f"WARNING: {name} will be meshed as soft tissue, but has the name of a bone. If it is one, add it to "
             "[mesh] bones."
@@ -206,7 +232,7 @@ class _Look:
 
     def soft(self, labels: LabelMap) -> list[str]:
         """Names of the tissues that are meshed."""
-        there, bones = np.unique(labels.labels), self.study.mesh.bones
+        there, bones = np.unique(labels.labels), bones_of(labels, self.study.mesh.bones)
         return [name for n, name in labels.names.items() if n != 0 and n in there and name not in bones]
 
     def at_simulations(self, reference: Image | None, labels: LabelMap | None) -> None:
@@ -247,16 +273,16 @@ class _Look:
             self.wrong.append(
                 f"[models] fixed: only 'cut' can be fixed in addition to the bone; got {', '.join(sorted(unknown))}."
             )
-        if labels is None:
+        if labels is None and not (self.study.makes_labels and self.study.mesh.labels is None):
             return
-        if reference is not None and self.study.mesh.labels is not None:
+        if labels is not None and reference is not None and self.study.mesh.labels is not None:
             there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
             if there < _THERE:
                 self.wrong.append(
                     f"{self.study.path(self.study.mesh.labels)}: only {there:.0%} of the labelled tissue lies in the "
                     "unloaded image. The label map to be meshed must be in the coordinates of the images."
                 )
-        soft = self.soft(labels)
+        soft = [name for name in NAMES.values() if not is_bones_name(name)] if labels is None else self.soft(labels)
         for one in sets:
             self.tried(one.for_regions, soft)
         if "cut" in fixed and "skin" not in {name.casefold() for name in soft}:

@@ -7,6 +7,7 @@ import numpy as np
 
 from dvc import TetMesh, read_image, read_labels
 from dvc.errors import InputError
+from dvc.measurement.subject import bones_of
 from dvc.registration.engine import Cost
 from dvc.threads import usable_cores
 from fe import LoadStep, material_set, paths_of, read_tet_mesh
@@ -29,7 +30,7 @@ _SOFT_MPA, _SOFTER = 0.01, 0.4
 # P2 took 2.2 GiB, MINI .84.
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
-_MESH_S = 25.0
+_MESH_S, _LABEL_S_PER_MVOXEL = 25.0, 5.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
 # with strain discontinuities 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells
@@ -52,6 +53,8 @@ def sizes_of(study: Study) -> tuple[float, float]:
     try:
         reference, how = read_image(study.path(study.images.load0), allow_missing=True), study.mesh
         voxels = float(np.prod(reference.grid.shape))
+        if study.makes_labels and how.file is None and how.labels is None:
+            return voxels, _LEAST_CELLS
         if not study.models.sets:
             return voxels, 0.0
         if how.file is not None:
@@ -59,7 +62,8 @@ def sizes_of(study: Study) -> tuple[float, float]:
         labels = read_labels(*labels_to_mesh(study))
     except (InputError, OSError):
         return _USUAL_VOXELS, _LEAST_CELLS
-    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in how.bones and n != 0])
+    bones = bones_of(labels, how.bones)
+    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in bones and n != 0])
     volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
     return voxels, max(volume / (_SHAPE * how.edge_mm**3), _LEAST_CELLS)
 
@@ -73,6 +77,8 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
         return registering * (1.5 if stage.kind == "level" else 1.0 + _TWIN * bool(stage.arguments.get("twin")))
     if stage.kind == "mesh":
         return _MESH_S
+    if stage.kind == "label":
+        return _LABEL_S_PER_MVOXEL * voxels / 1e6
     if stage.kind == "compare":
         models = len(set(stage.some.get("models", {}).values()))
         return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
@@ -102,8 +108,8 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
 
 def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
     """Approximate disk space for the results of a stage; parameters as in `seconds_of`."""
-    images = _BYTES_VOXEL * voxels if stage.kind in ("register", "level") else 0.0
-    models = {"register": 0, "level": 1, "mesh": 1}.get(stage.kind, len(study.loads))
+    images = _BYTES_VOXEL * voxels if stage.kind in ("label", "register", "level") else 0.0
+    models = {"label": 0, "register": 0, "level": 1, "mesh": 1}.get(stage.kind, len(study.loads))
     return images + 1e6 * _MB_MODEL * models
 
 

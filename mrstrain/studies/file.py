@@ -14,8 +14,9 @@ from dvc.errors import InputError
 from dvc.file_names import as_file_name, clash, one_spelling
 from dvc.io.result_folder import REPEAT
 from mrstrain.options import modelling
-from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFiles, Unit
+from mrstrain.options.measurement import AUTO, Frame, RegistrationOptions, SubjectFiles, Unit
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
+from mrstrain.records.inputs import made_labels
 
 FILE = "study.toml"
 _MOST_FAULTS = 20
@@ -47,7 +48,11 @@ class Images(SubjectFiles):
     load0: Path
     """Unloaded image."""
     labels: Path
-    """Label map of its tissues."""
+    """Label map of its tissues; "auto" makes it from the image, with the mask of the bone or marks."""
+    marks: Path | None = None
+    """With labels = "auto": label map of a few strokes in each tissue."""
+    mark_names: Path | None = None
+    """Table of the names of the marks."""
     bone_label: str | None = Field(default=None, validation_alias="bone")
     """Name of the bone's label, for the rigid alignment; by default "bone"."""
     bone: Path | None = Field(default=None, validation_alias="bone_mask")
@@ -56,6 +61,19 @@ class Images(SubjectFiles):
     """Second unloaded image, which measures the noise floor."""
     allow_missing: Flag = False
     """Whether NaN and infinite voxels are left out, instead of refusing the image."""
+
+    @model_validator(mode="after")
+    def _of_auto(self) -> Self:
+        if self.labels != AUTO:
+            if self.marks or self.mark_names:
+                raise ValueError("'marks' and 'mark_names' are only for labels = \"auto\"")
+        elif self.bone is None and self.marks is None:
+            raise ValueError("labels = \"auto\" needs 'bone_mask', the mask of the bone, or 'marks' with that bone")
+        elif self.names is not None:
+            raise ValueError("'names' is not for labels = \"auto\", which has names of its own")
+        elif self.allow_missing:
+            raise ValueError('labels = "auto" needs an image without missing voxels, so not allow_missing = true')
+        return self
 
 
 class Load(_Part):
@@ -165,10 +183,29 @@ class Study(_Part):
         }
 
     @property
+    def makes_labels(self) -> bool:
+        """Whether the label map is made from the image."""
+        return self.images.labels == AUTO
+
+    @property
+    def labels(self) -> tuple[Path, Path | None]:
+        """The label map of the unloaded image, given or made by the stage "label", and the table of its names."""
+        if self.makes_labels:
+            return made_labels(self.out)
+        return self.path(self.images.labels), self.optional_path(self.images.names)
+
+    @property
     def subject_files(self) -> SubjectFiles:
         """Masks and labels of the unloaded image; the bone by its mask, or else by its label."""
+        labels, names = self.labels
         files = self.images.narrowed(SubjectFiles).located(self.place)
-        return files if files.bone else files.model_copy(update={"bone_label": self.bone})
+        bone_label = None if files.bone else self.bone
+        return files.model_copy(update={"labels": labels, "names": names, "bone_label": bone_label})
+
+    def given(self, paths: Sequence[Path | None]) -> tuple[Path, ...]:
+        """Those of these files that are not made by the stage "label"."""
+        made = self.labels if self.makes_labels else ()
+        return tuple(path for path in paths if path is not None and path not in made)
 
     def path(self, given: str | Path) -> Path:
         """A path of the study file, relative to its folder."""

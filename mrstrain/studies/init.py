@@ -72,12 +72,16 @@ class NewStudy:
     path: Path
     inputs: StudyInputs
     picture: Path | str
+    makes_labels: bool = False  # whether the study makes the label map from the image
 
     def summary(self) -> list[str]:
         """Summary, a few lines: what was found and what is left to do."""
         found = self.inputs
         lines = [f"Load0: {found.load0 or 'NOT FOUND'}", f"Loads: {', '.join(found.loads.values()) or 'NONE FOUND'}"]
-        lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
+        labels = found.labels or (
+            "to be made from Load0 and the mask of the bone" if self.makes_labels else "NOT FOUND"
+        )
+        lines += [f"Labels: {labels}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Mask of the bone: {found.bone_mask}"] if found.bone_mask else []
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
@@ -85,19 +89,18 @@ class NewStudy:
         to_fill_in = [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
         todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
         lines += [f"Study file: {self.path}.{todo}", *to_fill_in, f"Next step: mrstrain check {self.path.parent}"]
-        lines += [] if found.labels or not found.loads else self._without_labels()
+        lines += [] if found.labels or self.makes_labels or not found.loads else self._without_labels()
         return [*lines, f"Picture of what was found: {self.picture}"]
 
     def _without_labels(self) -> list[str]:
-        """How to go on where the study has no label map."""
+        """How to go on where the study has neither a label map nor a mask of the bone."""
         place = self.path.parent
         load0, *loads = (place / name for name in (self.inputs.load0 or "Load0.nii.gz", *self.inputs.loads.values()))
-        bone = place / self.inputs.bone_mask if self.inputs.bone_mask else "BONE.nii.gz"
-        made = f"mrstrain label {load0} --bone {bone} --out {place / 'tissues.nii.gz'}"
-        measured = f"mrstrain register {load0} {' '.join(map(str, loads))} --bone {bone} --out {place / 'results'}"
+        measured = f"mrstrain register {load0} {' '.join(map(str, loads))} --bone BONE.nii.gz --out {place / 'results'}"
         return [
-            f"To make a label map from the image and a mask of the bone, then init again: {made}",
-            f"Without a label map, a mask of the bone is enough to measure: {measured}",
+            'Without a label map, paint a mask of the bone: with bone_mask and labels = "auto", the study makes the '
+            "label map from the image.",
+            f"The mask is also enough to measure without labels: {measured}",
         ]
 
 
@@ -142,9 +145,11 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
     forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
     sets = [name for name in published_names() if not name.endswith(_VARIANT) and name != _SOFTEST]
     bones = _bones(place, found, names, answers.bone or BONE)
+    mask = answers.bone_mask or (None if answers.bone else found.bone_mask)
+    auto = found.labels is None and mask is not None
     told = {"found": found, "name": name, "answers": answers, "forces": forces, "sets": sets, "bones": bones}
-    write_whole(target, template.render(told))
-    return NewStudy(target, found, picture)
+    write_whole(target, template.render(told | {"mask": mask, "auto": auto}))
+    return NewStudy(target, found, picture, auto)
 
 
 def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:

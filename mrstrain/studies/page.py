@@ -25,7 +25,8 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     """Write the report of a study, a self-contained page, and ``provenance.json`` next to it."""
     of_loads = {name: one.result for name, one in outcomes.items() if name.startswith("register ")}
     registered = [replace(s, title=f"Registration of {s.title}") for of in of_loads.values() for s in of.sections]
-    compared = [section for name, one in outcomes.items() if name not in of_loads for section in one.result.sections]
+    compared = [section for one in _of_kind(outcomes, "compare") for section in one.result.sections]
+    labelled = [section for one in _of_kind(outcomes, "label") for section in one.result.sections]
     closing = [section for one in outcomes.values() for section in one.result.closing]
     if not closing and registered:  # a study without a comparison gets the methods text of the measurement
         measured = [load for load in study.loads if outcomes[f"register {load}"].record is not None]
@@ -41,7 +42,7 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     against_truth = error_against_truth(study, outcomes)
     of_each = [section for of in of_loads.values() for section in of.sections if section.title in study.loads]
     answer = answer_of(of_each, compared[:1], study.out / COMPARISON)
-    others = [*against_truth, *compared[1:], *registered, _stages(outcomes)]
+    others = [*against_truth, *compared[1:], *registered, *labelled, _stages(outcomes)]
     sections = [*answer, *(replace(section, folded=True) for section in others)]
     verdict = _verdict(
         [s.verdict.among(s.title) for of in of_loads.values() for s in of.sections if s.verdict], compared
@@ -71,6 +72,10 @@ def write_page_in_progress(
         Section("Progress", None, (Table("Stages", ("stage", "state", "what it found"), tuple(rows)),)),
     ]
     write_report(path, study.study.name, None, sections, (), {}, notes=[told], reload_s=None if ended else _RELOAD_S)
+
+
+def _of_kind(outcomes: Mapping[str, StageOutcome], kind: str) -> list[StageOutcome]:
+    return [one for name, one in outcomes.items() if name.split(" ", 1)[0] == kind]
 
 
 def _strain(section: Section) -> list[Picture]:

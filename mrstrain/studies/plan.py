@@ -16,7 +16,7 @@ from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, Pla
 from mrstrain.studies.file import Study
 from validate import LEVELLED
 
-KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
+KINDS = ("label", "register", "mesh", "simulate", "drive", "level", "compare")
 """Kinds of stages, in their order."""
 
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
@@ -65,7 +65,7 @@ def plan(study: Study) -> tuple[Stage, ...]:
     InputError if two material sets or models would share a folder, a simulated load has no force, or a forward-model
     comparison has no bone.
     """
-    stages = _registrations(study)
+    stages = [*_labelling(study), *_registrations(study)]
     measured = {f"register {load}": load for load in study.loads}
     models: dict[str, Path] = {}
     if study.models.sets and study.mesh.file is None:
@@ -114,6 +114,21 @@ def _one_in_the_other(one: Path, other: Path) -> bool:
     return one.is_relative_to(other) or other.is_relative_to(one)
 
 
+def _labelling(study: Study) -> list[Stage]:
+    """The stage that makes the label map from the image, if one is to be made."""
+    if not study.makes_labels:
+        return []
+    images = study.images.located(study.place)
+    masks = {name: getattr(images, name) for name in ("bone", "tissue", "marks", "mark_names")}
+    labels, files = study.labels[0], [images.load0, *masks.values()]
+    return [Stage("label", {"load0": images.load0, **masks, "out": labels}, study.given(files), (labels.parent,))]
+
+
+def _labelled(study: Study) -> tuple[str, ...]:
+    """The stage that a stage which reads the label map waits for."""
+    return ("label",) if study.makes_labels else ()
+
+
 def _registrations(study: Study) -> list[Stage]:
     images, how, subject = study.images, study.registration.located(study.place), study.subject_files
     load0, folder = study.path(images.load0), study.out / REGISTRATION
@@ -135,8 +150,9 @@ def _registrations(study: Study) -> list[Stage]:
         floor = {f"register {REPEAT}": folder / REPEAT} if load != REPEAT and images.repeat is not None else {}
         stages.append(
             Stage(
-                f"register {load}", shared | own, (load0, *subject.paths, *how.paths, place), (folder / load,),
-                () if last is None else (f"register {last}",), perhaps={"repeat": floor},
+                f"register {load}", shared | own, study.given([load0, *subject.paths, *how.paths, place]),
+                (folder / load,), (*_labelled(study), *(() if last is None else (f"register {last}",))),
+                perhaps={"repeat": floor},
             )
         )  # fmt: skip
         last = load if how.chain and load != REPEAT else None
@@ -150,8 +166,9 @@ def mesh_place(study: Study) -> Path:
 
 def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
     """The label map that is meshed, and the table of its names."""
-    of = study.mesh if study.mesh.labels else study.images
-    return study.path(of.labels or ""), study.optional_path(of.names)
+    if study.mesh.labels is None:
+        return study.labels
+    return study.path(study.mesh.labels), study.optional_path(study.mesh.names)
 
 
 def _mesh(study: Study) -> Stage:
@@ -160,7 +177,8 @@ def _mesh(study: Study) -> Stage:
         "out": study.out / MESH, "labels": labels, "names": names, "bones": study.mesh.bones,
         **study.mesh.narrowed(Meshing).model_dump(),
     }  # fmt: skip
-    return Stage("mesh", arguments, (labels,) if names is None else (labels, names), ((study.out / MESH).parent,))
+    after = _labelled(study) if study.mesh.labels is None else ()
+    return Stage("mesh", arguments, study.given([labels, names]), ((study.out / MESH).parent,), after)
 
 
 def _on_mesh(
@@ -218,13 +236,14 @@ def _levelled(study: Study, folder: Path, load: str) -> Stage:
         "out": study.out / MODELS, "model": folder, "load": load,
     }  # fmt: skip
     gives = (folder.with_name(folder.name + LEVELLED) / f"{load}.vtu",)
-    own = (load0, *subject.paths, *engine.paths)
-    return Stage(f"level {folder.name} {load}", arguments, own, gives, (f"simulate {folder.name}",))
+    own = study.given([load0, *subject.paths, *engine.paths])
+    after = (*_labelled(study), f"simulate {folder.name}")
+    return Stage(f"level {folder.name} {load}", arguments, own, gives, after)
 
 
 def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, Path]) -> Stage:
     how = study.compare.located(study.place)
-    labels, names = study.path(study.images.labels), study.optional_path(study.images.names)
+    labels, names = study.labels
     elsewhere = [study.path(place) for place in study.models.results]
     simulated = dict.fromkeys(place.name for place in models.values())
     if twice := clash([*simulated, *(place.name for place in elsewhere)]):
@@ -235,6 +254,6 @@ def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, 
         **how.model_dump(), "elsewhere": elsewhere,
     }  # fmt: skip
     named = [file for place in elsewhere if place.exists() for file in files_named(place)]
-    files = [p for p in (labels, names, *how.paths, *elsewhere, *named) if p is not None]
+    files = study.given([labels, names, *how.paths, *elsewhere, *named])
     some = {"loads": measured} | ({"models": models} if models else {})
-    return Stage("compare", arguments, tuple(files), (study.out / COMPARISON,), (), some)
+    return Stage("compare", arguments, files, (study.out / COMPARISON,), _labelled(study), some)

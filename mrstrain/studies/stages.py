@@ -36,6 +36,14 @@ class StageResult:
         return [section.verdict for section in self.sections if section.verdict is not None]
 
 
+def label(tell: Tell, *, load0: Path, out: Path, **options: Any) -> StageResult:
+    """Make the label map from the unloaded image; as `mrstrain.label`."""
+    from mrstrain.measurement.label import label as run
+
+    done = run(load0, out=out, watch=lambda share: tell("tissues", share), **options)
+    return StageResult(tuple(done.summary()[:-1]), (done.section,), headline=done.headline)
+
+
 def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **options: Any) -> StageResult:
     """Register one loaded image; as `mrstrain.measurement.register.register_one`."""
     from mrstrain.measurement.register import register_one

@@ -18,6 +18,7 @@ import dvc
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.io import result_folder as files
 from dvc.measurement.page import key_figures
+from dvc.measurement.subject import LabelsFromImage
 from dvc.registration.register import Settings
 from dvc.report.page import Picture
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
@@ -51,6 +52,22 @@ def measured(tiny_pair, worker) -> dvc.Measurement:
             name="Load1",
             worker=worker,
         )
+
+
+def test_labels_made_from_the_image_are_told_and_count_in_the_verdict(measured) -> None:
+    def again(made: LabelsFromImage) -> dvc.Measurement:
+        subject = replace(measured.source.subject, from_image=made)
+        return dvc.Measurement.from_registration(measured.source.registration, subject)
+
+    sure, note = again(LabelsFromImage(0.2)), "No skin was found: too thick voxels."
+    before = dvc.Measurement.from_registration(measured.source.registration, measured.source.subject)
+    assert sure.verdict == before.verdict
+    drawn = dict.fromkeys(sure.drawings(), Picture("", "", PNG))
+    assert "The label map was made from the image; 20 % of its voxels are unsure." in sure.section(drawn).tables[0].note
+    unsure = again(LabelsFromImage(0.21, (note,)))
+    assert unsure.verdict.level == "caution"
+    assert unsure.verdict.reasons[-2] == f"The label map was made from the image. {note}"
+    assert "21 % of its voxels are unsure (use with care above 20 %)" in unsure.verdict.reasons[-1]
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,8 @@
 """`label`: what it writes, that `register` takes it, and what it refuses."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel
@@ -11,7 +13,10 @@ import mrstrain
 from dvc import Image, LabelMap, read_image, read_labels, read_mask, write_image, write_labels, write_mask
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_names
+from dvc.measurement.subject import LabelsFromImage
 from mrstrain.measurement.label import read_marks
+from mrstrain.options.measurement import SubjectFiles
+from mrstrain.records.inputs import made_from_image, read_subject
 from phantoms import Heel, heel_grid, labels_of, scan
 
 
@@ -47,8 +52,23 @@ def test_everything_is_written_and_agrees(folder: Path) -> None:
     assert record["inputs"]["bone"][0]["sha256"]
     assert 0.0 < record["unsure"] < 0.5
     told = (folder / "told.txt").read_text()
-    assert f"{record['unsure']:.0%} of the voxels are unsure" in told
+    assert f"{100 * record['unsure']:.0f} % of the voxels are unsure" in told
     assert told.endswith(f"Label map: {made / 'tissues.nii.gz'}")
+
+
+def test_a_measurement_knows_labels_that_were_made_from_the_image(folder: Path, tmp_path: Path) -> None:
+    made = shutil.copytree(folder / "made", tmp_path / "made")
+    known = made_from_image(made / "tissues.nii.gz")
+    assert known == LabelsFromImage(json.loads((made / "tissues.json").read_text())["unsure"])
+    assert not known.doubts
+    files = SubjectFiles(bone=folder / "bone.nii.gz", labels=made / "tissues.nii.gz", names=made / "tissues.csv")
+    assert read_subject(folder / "Load0.nii.gz", files).from_image == known
+    labels = read_labels(made / "tissues.nii.gz", made / "tissues.csv")
+    corrected = labels.labels.copy()
+    corrected[corrected == 2] = 3  # by hand
+    write_labels(made / "tissues.nii.gz", replace(labels, labels=corrected))
+    assert made_from_image(made / "tissues.nii.gz") is None
+    assert made_from_image(folder / "bone.nii.gz") is None
 
 
 def test_marks_without_names_have_the_usual_ones(folder: Path, tmp_path: Path) -> None:

@@ -80,8 +80,8 @@ TABLES: dict[type[Options], tuple[str, str]] = {  # table of the study file, and
 }
 NOT_IN_A_STUDY = {  # what a study has in its own way
     Scans: "repeat and allow_missing are keys of [images]; a start and landmarks belong to a single load",
-    Marks: "a label map is made before a study",
-    BoneAndBody: "part of SubjectFiles; a label map is made before a study",
+    Marks: "marks are keys of [images]",
+    BoneAndBody: "part of SubjectFiles",
     MeshAndAxes: "its directions are the plate's",
     Cores: "told when it is run",
     Threads: "one for each stage",

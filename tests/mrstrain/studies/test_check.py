@@ -97,12 +97,29 @@ def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
     values = np.ones(GRID.shape, dtype=np.int64)
     values[:4], values[4:6] = 2, 3
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 3: "talus"}))
+    assert told() == []  # every label that is named like a bone is one
+    (study / "study.toml").write_text(STUDY.replace("[mesh]", '[mesh]\nbones = ["bone"]'))
     assert told() == [
         "WARNING: talus will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] "
         "bones."
     ]
-    (study / "study.toml").write_text(STUDY.replace("[mesh]", '[mesh]\nbones = ["bone", "talus"]'))
-    assert told() == []
+
+
+def test_labels_that_are_made_later_are_checked_by_what_they_are_made_from(study):
+    auto = ('labels = "tissues.nii.gz"\nnames = "tissues.csv"', 'labels = "auto"\nmarks = "strokes.nii.gz"')
+    values = np.zeros(GRID.shape, dtype=np.int64)
+    values[1, 1, 1], values[8, 3, 3] = 1, 2
+    write_labels(study / "strokes.nii.gz", LabelMap(GRID, values, {1: "calcaneus", 2: "fat"}))
+    (study / "strokes.csv").write_text("label,name\n1,calcaneus\n2,fat\n")
+    named = (auto[0], auto[1] + '\nmark_names = "strokes.csv"')
+    assert "has no region 'bone'; it has calcaneus, fat" in wrong(study, named)
+    named = (auto[0], named[1] + '\nbone = "calcaneus"')
+    assert "no material for the region 'skin'" in wrong(study, named)  # mine.toml has a law for fat alone
+    assert wrong(study, named, ('"mine.toml", ', "")) == ""
+    assert "Labels: made from the image" in check(study).notes
+    elsewhere = LabelMap(replace(GRID, origin_mm=GRID.origin_mm + 500.0), values, {1: "calcaneus", 2: "fat"})
+    write_labels(study / "strokes.nii.gz", elsewhere)
+    assert "strokes.nii.gz" in wrong(study, named, ('"mine.toml", ', ""))
 
 
 def test_a_plate_without_friction_carries_no_shear(study):
@@ -155,7 +172,7 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
     write_labels(study / "tissues.nii.gz", tissues)
     align, measured = ("[registration]", '[registration]\nalign = "image"'), ('"mine.toml", "friedman"', "")
     assert wrong(study, measured).startswith("line 4: [images] 'bone': The label map has no region 'bone'")
-    assert "line 16: [mesh] 'bones': The label map has no label 'bone'" in wrong(study, align)  # a comparison needs one
+    assert "line 16: [mesh] 'bones': The label map has no region 'bone'" in wrong(study, align)  # a mesh needs one
     assert "no region 'sacrum'" in wrong(study, align, measured, ("labels =", 'bone = "sacrum"\nlabels ='))
     assert wrong(study, align, measured) == ""
     (stage,) = plan(read_study(study))

@@ -75,6 +75,10 @@ def test_everything_wrong_is_told_at_once_with_the_nearest_key(tmp_path):
         ('name = "Heel"', 'name = "Heel"\nout = "/tmp/elsewhere"', "is not below the folder of the study"),
         ('name = "Heel"', 'name = "Heel"\nout = "."', "is not below the folder of the study"),
         ('name = "Heel"', 'name = "Heel"\nseed = 0', "seed"),
+        ("tissues.nii.gz", "auto", "needs 'bone_mask', the mask of the bone, or 'marks'"),
+        ('"tissues.nii.gz"', '"auto"\nmarks = "m.nii.gz"\nnames = "n.csv"', "'names' is not for labels"),
+        ('"tissues.nii.gz"', '"auto"\nmarks = "m.nii.gz"\nallow_missing = true', "not allow_missing"),
+        ('"tissues.nii.gz"', '"tissues.nii.gz"\nmarks = "m.nii.gz"', "only for labels"),
         ("[study]", "[study", "not valid TOML"),
         ("[study]", 'place = "/tmp"\n[study]', "unknown key 'place'"),
     ],
@@ -119,6 +123,24 @@ def test_the_plan_names_every_stage_behind_what_it_waits_for(tmp_path):
     assert by_name["register Load2"].before == ("register repeat",)
     assert by_name["level trebbi Load1"].before == ("simulate trebbi",)
     assert tmp_path / "ansys" in by_name["compare"].files
+
+
+def test_labels_from_the_image_come_before_all_that_reads_them(tmp_path):
+    text = WHOLE.replace('"tissues.nii.gz"', '"auto"\nbone_mask = "bone.nii.gz"') + "level = true\n"
+    study = read_study(written(tmp_path, text))
+    stages = {stage.name: stage for stage in plan(study)}
+    made = tmp_path / "results" / "labels" / "tissues.nii.gz"
+    assert next(iter(stages)) == "label"
+    assert stages["label"].gives == (made.parent,)
+    assert [path.name for path in stages["label"].files] == ["Load0.nii.gz", "bone.nii.gz"]
+    readers = ["register Load1", "mesh", "level trebbi Load1", "compare"]
+    for name in readers:
+        assert "label" in stages[name].after, name
+        assert stages[name].arguments["labels"] == made, name
+        assert made not in stages[name].files, name
+    assert stages["register Load1"].arguments["bone_label"] is None  # the bone is that of the mask
+    other = read_study(written(tmp_path, text + '[mesh]\nlabels = "cut.nii.gz"\n'))
+    assert {stage.name: stage for stage in plan(other)}["mesh"].after == ()
 
 
 def test_chained_loads_wait_for_one_another(tmp_path):

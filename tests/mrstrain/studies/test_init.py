@@ -65,14 +65,25 @@ def test_two_unloaded_images_are_refused(tmp_path):
         init(folder_of(tmp_path, "Load0.nii.gz", "unloaded.nii.gz"))
 
 
-@pytest.mark.parametrize(("mask", "bone"), [((), "BONE.nii.gz"), (("calcaneus.nii.gz",), "{}/calcaneus.nii.gz")])
-def test_without_a_label_map_it_says_how_to_measure_all_the_same(tmp_path, mask, bone):
-    told = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "Load2.nii.gz", *mask)).summary()
+def test_without_a_label_map_it_says_how_to_measure_all_the_same(tmp_path):
+    told = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "Load2.nii.gz")).summary()
     images = " ".join(f"{tmp_path}/Load{n}.nii.gz" for n in range(3))
-    command = f"mrstrain register {images} --bone {bone.format(tmp_path)} --out {tmp_path}/results"
-    assert f"Without a label map, a mask of the bone is enough to measure: {command}" in told
-    assert any(line.startswith("To make a label map") and "mrstrain label" in line for line in told)
+    command = f"mrstrain register {images} --bone BONE.nii.gz --out {tmp_path}/results"
+    assert f"The mask is also enough to measure without labels: {command}" in told
+    assert any(line.startswith("Without a label map") and 'labels = "auto"' in line for line in told)
     assert not any("Without a label map" in line for line in NewStudy(tmp_path / "study.toml", LABELLED, "").summary())
+
+
+def test_with_a_mask_of_the_bone_the_study_makes_its_label_map(tmp_path):
+    made = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "calcaneus.nii.gz"))
+    told = made.summary()
+    assert "Labels: to be made from Load0 and the mask of the bone" in told
+    assert not any("Without a label map" in line for line in told)
+    study = read_study(made.path)
+    assert study.makes_labels
+    assert study.images.bone == Path("calcaneus.nii.gz")
+    assert study.mesh.bones == ()
+    assert not any("names" in line and "FILL IN" in line for line in made.path.read_text().splitlines())
 
 
 def tables_of(text: str) -> dict[str, dict[str, str]]:
