@@ -7,7 +7,7 @@ from skimage.segmentation import watershed
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 _BLUR_MM = 0.5
-_CORE_MM = 1.2  # from what is dark: gaps in a rim that are narrower do not join bone and soft tissue
+_CORE_MM = 1.2  # from what is dark, and more than a slice: narrower gaps in a rim do not join bone and soft tissue
 _LEAST_ML = 0.3
 _RIM_MM = 1.5  # thickness of a dark rim beyond its darkest part, at most
 
@@ -31,7 +31,7 @@ def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: Fl
     """
     blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
     lit = where & (blurred > dark)
-    parts, count = label(distance_transform_edt(lit, sampling=spacing_mm) > _CORE_MM)
+    parts, count = label(distance_transform_edt(lit, sampling=spacing_mm) > max(_CORE_MM, float(spacing_mm.max())))
     sizes_ml = np.bincount(parts.ravel(), minlength=count + 1) * float(np.prod(spacing_mm)) / 1000.0
     sizes_ml[0] = 0.0
     large = np.flatnonzero(sizes_ml >= _LEAST_ML)

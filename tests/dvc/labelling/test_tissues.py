@@ -121,6 +121,17 @@ def test_marrow_in_a_dark_rim_is_bone_and_the_rim_with_it() -> None:
     assert not bones_in((600.0 + noise).astype(np.float32), np.ones(grid.shape, dtype=bool), 280.0, SPACING).any()
 
 
+def test_a_gap_of_one_thick_slice_in_the_rim_does_not_join_bone_and_soft_tissue() -> None:
+    grid = Grid((60, 60, 30), (0.8, 0.8, 1.6), np.zeros(3))
+    at = grid.points() - grid.centre_mm
+    radius = np.linalg.norm(at, axis=-1)
+    values = np.where(radius < 9.0, 700.0, np.where(radius < 11.0, 60.0, 600.0))
+    one_slice = (at[..., 2] > 0.0) & (at[..., 2] < 1.6)
+    values[one_slice & (np.abs(at[..., 1]) < 4.0) & (at[..., 0] > 0.0) & (radius > 8.0)] = 600.0
+    found = bones_in(values.astype(np.float32), np.ones(grid.shape, dtype=bool), 280.0, grid.spacing_mm)
+    assert dice(found == 1, radius < 11.0) > 0.95
+
+
 @pytest.fixture(scope="module")
 def labelled() -> tuple[TissueLabels, FloatArray]:
     """A heel at 1.2 mm, labelled from its bone alone; and its true labels."""
