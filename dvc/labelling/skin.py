@@ -58,12 +58,13 @@ class Skin:
         body : Mask
             On the image's grid.
         without : (ni, nj, nk) bool
-            Voxels that are left out, such as bone, which is as dark as skin and may lie close below it.
+            Voxels that are left out: those without a value, and bone, which is as dark as skin and may lie close
+            below it.
         """
         spacing = image.grid.spacing_mm
         depth = depth_mm(body.inside, spacing)
-        outside = ~binary_dilation(body.inside, iterations=_AWAY)
-        profiles = _Profiles.of(image, depth, ~without & np.isfinite(image.values))
+        outside = ~binary_dilation(body.inside, iterations=_AWAY) & ~without
+        profiles = _Profiles.of(image, depth, ~without)
         voxel = float(spacing.mean())
         values, weights = profiles.pooled()
         if not outside.any() or np.count_nonzero(weights) < _LEAST_DEPTHS:
