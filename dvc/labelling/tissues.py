@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import binary_fill_holes
 
 from dvc.arguments import checked
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
@@ -66,7 +67,8 @@ def label_tissues(
     Parameters
     ----------
     image : Image
-        Unloaded image, such as a T1- or proton-density-weighted one, where fat is brighter than muscle and skin.
+        Unloaded image, such as a T1- or proton-density-weighted one, where fat is brighter than muscle and skin. Where
+        it ends in missing voxels, nothing is labelled; holes in it are.
     bone : Mask, optional
         The bone, on any grid of the image's frame.
     body : Mask, optional
@@ -103,17 +105,21 @@ def label_tissues(
         )
     whole = whole | known
     watch(0.1)
-    marked, outside = _in_soft_tissue(marked, soft, known)
     even = fill_missing(without_bias_field(image))
     watch(0.15)
+    skin = Skin.of(even, Mask(grid, whole), known | image.missing)
+    watch(0.5)
+    if image.missing.any():  # holes are filled, but the body ends where the image does
+        soft = soft & binary_fill_holes(~image.missing)
+        whole = soft | known
+    marked, outside = _in_soft_tissue(marked, soft, known)
     chance, notes = {NAMES[1]: known.astype(np.float32)} if known.any() else {}, list[str]()
     left = soft.astype(np.float32)  # probability that is not given to a tissue yet
-    if (skin := Skin.of(even, Mask(grid, whole), known | image.missing)) is None:
+    if skin is None:
         notes.append("No skin was found: the image shows no darker layer at the surface of the body.")
     else:
         chance["skin"] = np.where(soft, skin.probability, 0.0).astype(np.float32)
         left -= chance["skin"]
-    watch(0.5)
     chance |= _below_skin(even.values, soft & (left > 0.5), left, spacing, marked)
     if {"fat", "muscle"} <= set(marked) and _marked_levels(even.values, marked) is None:
         notes.append(

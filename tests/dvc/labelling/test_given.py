@@ -108,3 +108,14 @@ def test_probabilities_sum_to_one_where_no_walk_reaches_a_mark() -> None:
     assert made.sum(axis=0)[where] == pytest.approx(1.0, abs=1e-6)
     assert np.array_equal(made[:, 23:25], found[:, 23:25])
     assert made[1][mark].min() == 1.0
+
+
+def test_nothing_is_labelled_where_the_image_ends_and_holes_are() -> None:
+    """The cut through the body is no surface with skin."""
+    values, plain = body().values.copy(), label_tissues(body(), BONE)
+    values[36:] = values[10, 20:22, 20:22] = np.nan
+    made = label_tissues(Image(GRID, values), BONE)
+    assert not made.labels.labels[36:].any()
+    assert not made.probability[:, 36:].any()
+    assert made.labels.labels[10, 20:22, 20:22].all()
+    assert np.mean(made.labels.labels[:36] == plain.labels.labels[:36]) > 0.98
