@@ -38,7 +38,10 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     number = np.empty(inside.shape, dtype=np.int32)
     number[seeds] = np.arange(len(border))
     far = ~sure
-    depth[far] *= np.linalg.norm(np.argwhere(far) * spacing_mm - border[number[tuple(to[:, far])]], axis=-1)
+    there, squares = number[tuple(to[:, far])], np.zeros(np.count_nonzero(far))
+    for at, spacing, of in zip(np.ogrid[tuple(map(slice, inside.shape))], spacing_mm, border.T, strict=True):
+        squares += (np.broadcast_to(at, inside.shape)[far] * spacing - of[there]) ** 2  # an axis at a time: less memory
+    depth[far] *= np.sqrt(squares)
     depth[sure] = near_mm
     depth = gaussian_filter(depth, _EVEN, mode="nearest")
     return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))
