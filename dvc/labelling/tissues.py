@@ -223,7 +223,7 @@ def _named_bones(
 ) -> dict[str, BoolArray]:
     """Bones by the names of their marks; those without a mark are "other bone"."""
     parts = bones_in(values, below, dark, spacing_mm)
-    named: dict[str, BoolArray] = {}
+    named, taken = dict[str, BoolArray](), dict[int, str]()
     for name, mark in marked.items():
         if not is_bones_name(name) or name == NAMES[5] or not (mark & below).any():
             continue
@@ -233,6 +233,11 @@ def _named_bones(
                 f"The mark of {name} is not in marrow inside a closed dark rim, so the bone cannot be found from it. "
                 "Paint the whole bone and give it as the mask (bone)."
             )
-        named[name] = parts == number
-        parts = np.where(named[name], 0, parts)
+        if number in taken:
+            raise InputError(
+                f"No dark rim separates {name} from {taken[number]}, so only one of them can be found from its mark. "
+                "Paint the bone on which images are aligned and give it as the mask (bone)."
+            )
+        named[name], taken[number] = parts == number, name
+    parts = np.where(np.isin(parts, list(taken)), 0, parts)
     return named | ({NAMES[5]: parts > 0} if (parts > 0).any() else {})

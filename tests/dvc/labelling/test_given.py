@@ -58,6 +58,12 @@ def test_a_mark_of_another_bone_needs_its_own_name_where_the_bone_is_given() -> 
     assert made.labels.region("talus").inside.sum() == pytest.approx(ball(OTHER, 7.5).sum(), rel=0.03)
 
 
+def test_two_names_for_one_bone_are_refused() -> None:
+    both = marks(calcaneus=ball(ONE, 2.0), talus=ball(OTHER, 2.0), navicular=ball((9.5, 0.0, 8.0), 1.2))
+    with pytest.raises(InputError, match="No dark rim separates navicular from talus"):
+        label_tissues(body(), marks=both)
+
+
 def test_other_bones_stay_where_one_of_them_is_marked_as_that() -> None:
     small = Mask(GRID, ball((0.0, 9.0, -9.0), 4.0))
     plain = label_tissues(body(), small)
