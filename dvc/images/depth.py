@@ -26,8 +26,9 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     sure = (blurred > _SURE) & (blurred < 1.0 - _SURE)
     normal = np.stack([np.gradient(blurred, h, axis=axis)[sure] for axis, h in enumerate(spacing_mm)], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    near_mm = _BLUR * np.linalg.norm(normal * spacing_mm, axis=-1) * ndtri(blurred[sure])
-    depth, nearest = np.where(inside, 1.0, -1.0), np.abs(near_mm) < _NEAR * spacing_mm.mean()
+    voxel_mm = np.linalg.norm(normal * spacing_mm, axis=-1)  # along the normal: far more across thick slices
+    near_mm = _BLUR * voxel_mm * ndtri(blurred[sure])
+    depth, nearest = np.where(inside, 1.0, -1.0), np.abs(near_mm) < _NEAR * voxel_mm
     if not nearest.any():  # one tissue fills everything
         return np.asarray(depth * float(np.linalg.norm(np.array(inside.shape) * spacing_mm)))
     seeds = np.zeros_like(inside)
@@ -37,7 +38,10 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     number = np.empty(inside.shape, dtype=np.int32)
     number[seeds] = np.arange(len(border))
     far = ~sure
-    depth[far] *= np.linalg.norm(np.argwhere(far) * spacing_mm - border[number[tuple(to[:, far])]], axis=-1)
+    there, squares = number[tuple(to[:, far])], np.zeros(np.count_nonzero(far))
+    for at, spacing, of in zip(np.ogrid[tuple(map(slice, inside.shape))], spacing_mm, border.T, strict=True):
+        squares += (np.broadcast_to(at, inside.shape)[far] * spacing - of[there]) ** 2  # an axis at a time: less memory
+    depth[far] *= np.sqrt(squares)
     depth[sure] = near_mm
     depth = gaussian_filter(depth, _EVEN, mode="nearest")
     return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))

@@ -7,12 +7,10 @@ from skimage.segmentation import watershed
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 _BLUR_MM = 0.5
-_CORE_MM = 2.5  # from what is dark: gaps in a rim that are narrower than 5 mm do not join bone and soft tissue
+_CORE_MM = 2.5  # from what is dark, and more than a slice: narrower gaps in a rim do not join bone and soft tissue
 _LEAST_ML = 0.1  # of a core
 _RIM_MM = 1.5  # thickness of a dark rim beyond its darkest part, at most
-_DARK_RIM = (
-    0.6  # brightness of a rim over that of the darker side; .37 to .52 for bones, .8 or more between soft tissues
-)
+_DARK_RIM = 0.6  # brightness of a rim over that of its darker side; .37 to .52 for bones, .8 or more for soft tissue
 
 
 def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: FloatArray) -> IntArray:
@@ -35,7 +33,7 @@ def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: Fl
     """
     blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
     lit = where & (blurred > dark)
-    parts, count = label(distance_transform_edt(lit, sampling=spacing_mm) > _CORE_MM)
+    parts, count = label(distance_transform_edt(lit, sampling=spacing_mm) > max(_CORE_MM, float(spacing_mm.max())))
     sizes_ml = np.bincount(parts.ravel(), minlength=count + 1) * float(np.prod(spacing_mm)) / 1000.0
     sizes_ml[0] = 0.0
     large = np.flatnonzero(sizes_ml >= _LEAST_ML)

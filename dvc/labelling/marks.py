@@ -18,6 +18,7 @@ _BLUR_MM = 0.5
 _EVEN = 3.0  # times the median step between neighbouring voxels: a walk avoids larger steps
 _LEAST_WEIGHT = 1e-4
 _CONVERGED = 1e-5
+_REACHED = 0.5
 _LEAST_STEP = 0.15  # between the brightness of a marked tissue and that of muscle, as a share of the latter
 
 
@@ -44,7 +45,7 @@ def grown(
 
 
 def corrected(
-    values: Float32Array, probability: Float32Array, marks: Mapping[int, BoolArray], grid: Grid
+    values: Float32Array, probability: Float32Array, where: BoolArray, marks: Mapping[int, BoolArray], grid: Grid
 ) -> Float32Array:
     """Probability (n, ni, nj, nk) of tissues, found again within 8 mm of the marks that they do not agree with.
 
@@ -57,14 +58,16 @@ def corrected(
     values : (ni, nj, nk)
         Image without its bias field.
     probability : (n, ni, nj, nk)
-        Probability of each tissue; 0 outside the body.
+        Probability of each tissue.
+    where : (ni, nj, nk) bool
+        Voxels that may change: the body without a bone that is known. Marks lie in it.
     marks : mapping
         Marked voxels (ni, nj, nk) by the place of their tissue in ``probability``.
     grid : Grid
         Voxels, LPS mm.
     """
     found = np.array(probability)
-    labels = np.where(found.max(axis=0) > 0.0, found.argmax(axis=0) + 1, -1)  # -1: not a part of the body
+    labels = np.where(where, found.argmax(axis=0) + 1, -1)  # no walk goes to -1
     wrong = np.zeros(grid.shape, dtype=bool)
     fixed = np.zeros(grid.shape, dtype=np.int64)
     for number, mark in marks.items():
@@ -82,9 +85,10 @@ def corrected(
         present = np.unique(seeds[seeds > 0])
         numbered = np.where(seeds > 0, np.searchsorted(present, seeds) + 1, seeds)
         walked = _walked(blurred[box], numbered, len(present), grid.spacing_mm)
-        inside = again | (fixed[box] > 0)
+        total = walked.sum(axis=0)  # 1, but for what conjugate gradients leave, and 0 where no walk reaches a seed
+        inside = (again | (fixed[box] > 0)) & (total > _REACHED)
         chance = np.zeros((len(found), *seeds.shape), dtype=np.float32)
-        chance[present - 1] = walked
+        chance[present - 1] = walked / np.maximum(total, _REACHED)
         found[(slice(None), *box)] = np.where(inside, chance, found[(slice(None), *box)])
     return found
 

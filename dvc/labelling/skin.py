@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 from scipy.special import ndtr
 
 from dvc.arrays import BoolArray, FloatArray
@@ -58,12 +58,13 @@ class Skin:
         body : Mask
             On the image's grid.
         without : (ni, nj, nk) bool
-            Voxels that are left out, such as bone, which is as dark as skin and may lie close below it.
+            Voxels that are left out: those without a value, and bone, which is as dark as skin and may lie close
+            below it.
         """
         spacing = image.grid.spacing_mm
         depth = depth_mm(body.inside, spacing)
-        outside = ~binary_dilation(body.inside, iterations=_AWAY)
-        profiles = _Profiles.of(image, depth, ~without & np.isfinite(image.values))
+        outside = ~binary_dilation(body.inside, iterations=_AWAY) & ~without
+        profiles = _Profiles.of(image, depth, ~without)
         voxel = float(spacing.mean())
         values, weights = profiles.pooled()
         if not outside.any() or np.count_nonzero(weights) < _LEAST_DEPTHS:
@@ -131,8 +132,12 @@ class _Profiles:
         size = np.array(self.block) * self.spacing_mm
         nearest = distance_transform_edt(lacking, sampling=size, return_distances=False, return_indices=True)
         filled = blocks[tuple(nearest)]
-        at = [(np.arange(n) - 0.5 * (b - 1)) / b for n, b in zip(shape, self.block, strict=True)]
-        return np.asarray(map_coordinates(filled, np.meshgrid(*at, indexing="ij"), order=1, mode="nearest"))
+        for n, b in zip(shape, self.block, strict=True):  # linear along one axis, which goes last, after the other
+            count = filled.shape[0]
+            at = np.clip((np.arange(n) - 0.5 * (b - 1)) / b, 0.0, count - 1.0)
+            weights = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(count)))
+            filled = np.tensordot(filled, weights, axes=(0, 1))
+        return np.asarray(filled)
 
 
 def _profile(sums: FloatArray, counts: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -4,9 +4,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import binary_fill_holes
 
 from dvc.arguments import checked
-from dvc.arrays import BoolArray, Float32Array, FloatArray, frozen
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Image, LabelMap, Mask
@@ -23,6 +24,8 @@ NAMES = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
 """Numbers and names of the tissues that can be found without marks."""
 _DARK = 0.7  # of muscle's brightness: darker are cortical bone and tendon
 _SURE = 0.9
+_LEAST_IN_BODY = 0.5  # of the bone
+_DARK_MARROW = 0.25  # of the step from muscle to fat: 0.5 and more in phantoms with slices of up to 3 mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +67,8 @@ def label_tissues(
     Parameters
     ----------
     image : Image
-        Unloaded image, such as a T1- or proton-density-weighted one, where fat is brighter than muscle and skin.
+        Unloaded image, such as a T1- or proton-density-weighted one, where fat is brighter than muscle and skin. Where
+        it ends in missing voxels, nothing is labelled; holes in it are.
     bone : Mask, optional
         The bone, on any grid of the image's frame.
     body : Mask, optional
@@ -72,14 +76,16 @@ def label_tissues(
     marks : LabelMap, optional
         A few voxels of each tissue, by name, on any grid of the image's frame. A bone that is marked is found inside
         its dark rim; marked fat and muscle tell their brightness; another tissue, such as tendon, is found where it is
-        joined to its mark. Where a mark is in the wrong tissue, the tissues within 8 mm are found again.
+        joined to its mark. Where a mark is in the wrong tissue, the tissues within 8 mm are found again. A bone that is
+        given as a mask stays as it is: marks in it change nothing.
     watch : callable, optional
         Told how far it is, from 0 to 1.
 
     Raises
     ------
     InputError
-        If neither a bone nor the mark of one is given, a marked bone has no closed dark rim, or no soft tissue is left.
+        If neither a bone nor the mark of one is given, a bone or its mark is not where it can be, or no soft tissue is
+        left.
     GeometryError
         If a mask does not lie on the image.
     """
@@ -88,37 +94,57 @@ def label_tissues(
     if bone is None and not any(map(is_bones_name, marked)):
         raise InputError("Labels need the mask of a bone (bone), or the mark of one, such as 'calcaneus' (marks).")
     known = np.zeros(grid.shape, dtype=bool) if bone is None else fit_mask(bone, grid, "bone").inside
-    whole = (tissue_mask(image) if body is None else fit_mask(body, grid, "body")).inside | known
+    whole = (tissue_mask(image) if body is None else fit_mask(body, grid, "body")).inside
     soft = whole & ~known
     if not soft.any():
         raise InputError("The bone leaves no soft tissue in the body. Check the masks.")
+    if known.any() and (share := float(whole[known].mean())) < _LEAST_IN_BODY:
+        raise InputError(
+            f"Only {share:.0%} of the bone is in the body. The mask of the bone (bone) was drawn on another image, or "
+            "that of the body (body; --tissue on the command line) lacks a part."
+        )
+    whole = whole | known
     watch(0.1)
     even = fill_missing(without_bias_field(image))
     watch(0.15)
+    skin = Skin.of(even, Mask(grid, whole), known | image.missing)
+    watch(0.5)
+    if image.missing.any():  # holes are filled, but the body ends where the image does
+        soft = soft & binary_fill_holes(~image.missing)
+        whole = soft | known
+    marked, outside = _in_soft_tissue(marked, soft, known)
     chance, notes = {NAMES[1]: known.astype(np.float32)} if known.any() else {}, list[str]()
     left = soft.astype(np.float32)  # probability that is not given to a tissue yet
-    if (skin := Skin.of(even, Mask(grid, whole), known)) is None:
+    if skin is None:
         notes.append("No skin was found: the image shows no darker layer at the surface of the body.")
     else:
         chance["skin"] = np.where(soft, skin.probability, 0.0).astype(np.float32)
         left -= chance["skin"]
-    watch(0.5)
     chance |= _below_skin(even.values, soft & (left > 0.5), left, spacing, marked)
+    if {"fat", "muscle"} <= set(marked) and _marked_levels(even.values, marked) is None:
+        notes.append(
+            "Where fat is marked, the image is not brighter than where muscle is marked. Check the names of the marks; "
+            "if fat is suppressed, give an image in which it is bright."
+        )
     if "muscle" not in chance:
         notes.append("One tissue was found below the skin: its brightness does not separate fat from muscle.")
-    unused = [name for name, mark in marked.items() if name not in chance and (mark & ~known).any()]
-    notes += [
-        f"The marks of {name} were not used: the image does not show it as a tissue of its own." for name in unused
-    ]
+    because = dict.fromkeys(outside, "they lie outside the body, or in the mask of the bone")
+    because |= dict.fromkeys(set(marked) - set(chance), "the image does not show it as a tissue of its own")
+    notes += [f"The marks of {name} were not used: {because[name]}." for name in sorted(because)]
     watch(0.9)
     names = [name for name in NAMES.values() if name in chance] + sorted(set(chance) - {*NAMES.values()})
     probability = frozen(np.stack([chance[name] for name in names]), np.float32)
     if marked:
-        at = {names.index(name): mark & whole for name, mark in marked.items() if name in chance}
-        probability = frozen(corrected(even.values, probability, at, grid), np.float32)
+        at = {names.index(name): mark for name, mark in marked.items() if name in chance}
+        probability = frozen(corrected(even.values, probability, soft, at, grid), np.float32)
     numbered = {number: name for number, name in NAMES.items() if name in chance}
     numbered |= dict(enumerate(names[len(numbered) :], len(NAMES) + 1))
     labels = np.where(whole, np.array([*numbered])[probability.argmax(axis=0)], 0)
+    if _is_dark(even.values, known, labels):
+        notes.append(
+            "The bone is about as dark as muscle. If fat is suppressed in this image, fat and muscle are mistaken for "
+            "each other: give an image in which fat is bright."
+        )
     watch(1.0)
     return TissueLabels(LabelMap(grid, labels, numbered), probability, tuple(notes))
 
@@ -129,6 +155,38 @@ def _regions(marks: LabelMap) -> Iterator[tuple[str, BoolArray]]:
     for number, name in marks.names.items():
         if (mark := marks.labels == number).any():
             yield name.casefold() if name.casefold() in own else name, mark
+
+
+def _is_dark(values: Float32Array, bone: BoolArray, labels: IntArray) -> bool:
+    """Whether a bone, whose marrow is mostly fat, is about as dark as what is labelled muscle."""
+    parts = bone, labels == 2, labels == 3
+    if not all(part.any() for part in parts):
+        return False
+    marrow, fat, muscle = (float(np.median(values[part])) for part in parts)
+    return marrow < muscle + _DARK_MARROW * (fat - muscle)
+
+
+def _in_soft_tissue(
+    marked: Mapping[str, BoolArray], soft: BoolArray, bone: BoolArray
+) -> tuple[dict[str, BoolArray], list[str]]:
+    """Marks where they can tell something, and the names of those that lie elsewhere.
+
+    A bone's mark that touches the mask of the bone is one of this bone, which is known.
+    """
+    inside, outside = dict[str, BoolArray](), list[str]()
+    for name, mark in marked.items():
+        if is_bones_name(name) and (mark & bone).any():
+            continue
+        if name == NAMES[1] and bone.any():
+            raise InputError(
+                f"The marks of {name} lie outside the mask of the bone. If they mark another bone, give its own name, "
+                "such as talus (mark_names); if not, correct the mask."
+            )
+        if (mark & soft).any():
+            inside[name] = mark & soft
+        else:
+            outside.append(name)
+    return inside, outside
 
 
 def _below_skin(
@@ -165,9 +223,9 @@ def _named_bones(
 ) -> dict[str, BoolArray]:
     """Bones by the names of their marks; those without a mark are "other bone"."""
     parts = bones_in(values, below, dark, spacing_mm)
-    named: dict[str, BoolArray] = {}
+    named, taken = dict[str, BoolArray](), dict[int, str]()
     for name, mark in marked.items():
-        if not is_bones_name(name) or not (mark & below).any():
+        if not is_bones_name(name) or name == NAMES[5] or not (mark & below).any():
             continue
         number = int(np.bincount(parts[mark & below]).argmax())
         if number == 0:
@@ -175,6 +233,11 @@ def _named_bones(
                 f"The mark of {name} is not in marrow inside a closed dark rim, so the bone cannot be found from it. "
                 "Paint the whole bone and give it as the mask (bone)."
             )
-        named[name] = parts == number
-        parts = np.where(named[name], 0, parts)
+        if number in taken:
+            raise InputError(
+                f"No dark rim separates {name} from {taken[number]}, so only one of them can be found from its mark. "
+                "Paint the bone on which images are aligned and give it as the mask (bone)."
+            )
+        named[name], taken[number] = parts == number, name
+    parts = np.where(np.isin(parts, list(taken)), 0, parts)
     return named | ({NAMES[5]: parts > 0} if (parts > 0).any() else {})

@@ -90,17 +90,20 @@ def test_a_tissue_is_found_where_it_is_joined_to_its_mark_and_no_further() -> No
     assert not grown(values, np.zeros_like(mark), everywhere, 400.0, SPACING).any()
 
 
-def test_a_correction_follows_the_image_and_stays_near_its_mark() -> None:
-    i = np.broadcast_to(np.arange(40)[:, None, None], GRID.shape)
-    values = np.where(i < 20, 400.0, 600.0) + np.random.default_rng(8).normal(0.0, 20.0, GRID.shape)
+@pytest.mark.parametrize("spacing_mm", [(1.0, 1.0, 1.0), (0.8, 0.8, 1.6), (0.6, 2.0, 0.6)])
+def test_a_correction_follows_the_image_and_stays_near_its_mark(spacing_mm: tuple[float, float, float]) -> None:
+    grid = Grid(GRID.shape, spacing_mm, (0.0, 0.0, 0.0))
+    i = np.broadcast_to(np.arange(40)[:, None, None], grid.shape)
+    values = np.where(i < 20, 400.0, 600.0) + np.random.default_rng(8).normal(0.0, 20.0, grid.shape)
     wrong = np.stack([i < 26, i >= 26]).astype(np.float32)  # the border lies 6 voxels off
-    mark = np.zeros(GRID.shape, dtype=bool)
+    mark = np.zeros(grid.shape, dtype=bool)
     mark[21:25, 20, 20] = True
-    found = corrected(values.astype(np.float32), wrong, {1: mark}, GRID)
-    assert found.sum(axis=0) == pytest.approx(1.0, abs=1e-3)
-    far = distance_transform_edt(~mark) > 8.0
-    assert np.array_equal(found[:, far], wrong[:, far])
-    near = distance_transform_edt(~mark) < 4.0
-    assert np.mean((found[1] > 0.5) == (i >= 20), where=near) > 0.99
-    same = corrected(values.astype(np.float32), wrong, {0: (i < 10) & mark}, GRID)
+    where = np.ones(grid.shape, dtype=bool)
+    found = corrected(values.astype(np.float32), wrong, where, {1: mark}, grid)
+    assert found.sum(axis=0) == pytest.approx(1.0, abs=1e-6)
+    away_mm = distance_transform_edt(~mark, sampling=spacing_mm)
+    assert np.array_equal(found[:, away_mm > 8.0], wrong[:, away_mm > 8.0])
+    assert np.mean((found[1] > 0.5) == (i >= 20), where=away_mm < 4.0) > 0.99
+    assert (away_mm[found[1] != wrong[1]]).max() > 7.0
+    same = corrected(values.astype(np.float32), wrong, where, {0: (i < 26) & mark}, grid)
     assert np.array_equal(same, wrong)  # marks that agree change nothing
