@@ -13,6 +13,8 @@ from importlib import import_module
 from typing import Any, TypeVar
 
 from loky import ProcessPoolExecutor
+from loky.backend.context import LokyContext
+from loky.backend.process import LokyProcess
 from loky.process_executor import ShutdownExecutorError, TerminatedWorkerError
 
 from dvc.errors import WorkerError
@@ -52,6 +54,24 @@ def is_lack_of_memory(failure: BaseException | None) -> bool:
             return True
         failure = failure.__cause__
     return False
+
+
+class _Child(LokyProcess):  # type: ignore[misc]
+    """A child that ends without a traceback where memory runs out beside its task; the caller sees that it died."""
+
+    def run(self) -> None:
+        try:
+            super().run()
+        except Exception as failure:
+            if not is_lack_of_memory(failure):
+                raise
+            sys.exit(1)
+
+
+class _Children(LokyContext):  # type: ignore[misc]
+    """How loky starts processes, with ours."""
+
+    Process = _Child
 
 
 class Worker(AbstractContextManager["Worker", None]):
@@ -125,7 +145,9 @@ class Worker(AbstractContextManager["Worker", None]):
             names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
             # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process.
             environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"} | _MEMORY
-            self._executor = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
+            self._executor = ProcessPoolExecutor(
+                1, context=_Children(), env=environment, initializer=_end_with, initargs=(os.getpid(),)
+            )
         return self._executor
 
     def kill(self) -> None:

@@ -168,7 +168,7 @@ ROWS = {
     ),
     25: Row(
         "two runs in one output folder", "the second refuses",
-        (f"{RUN}test_two_runs_in_one_folder", f"{RUN}test_two_commands_in_one_folder",
+        ("mrstrain/records/test_one_run_in_a_folder.py::test_a_second_run_is_refused_and_writes_nothing",
          "mrstrain/records/test_inputs.py::test_two_runs_do_not_write_to_one_folder"),
     ),
     26: Row(

@@ -7,9 +7,9 @@ alignment then follows soft tissue, and a strain that looks sound is measured re
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_gradient_magnitude
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import BoolArray, Float32Array
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
 
@@ -27,8 +27,7 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
     The mask is on the image's grid. Its sharpness is the median of the image's gradient at the mask's surface, over
     that 2.5 to 6 mm inside and outside of it; mirror images are those along the voxel axes, about the image's middle.
     """
-    blur = np.maximum(_BLUR_MM / image.grid.spacing_mm, _LEAST_BLUR)
-    gradient = gaussian_gradient_magnitude(fill_missing(image).values.astype(np.float32), blur)
+    gradient = _gradient(image)
     i, j, k = (slice(_ENDS, n - _ENDS) for n in image.grid.shape)
     gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
     if not bone.inside.any() or bone.inside.all():
@@ -53,7 +52,17 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
     )
 
 
-def _sharpness(gradient: FloatArray, at: BoolArray, near: BoolArray) -> float:
+def _gradient(image: Image) -> Float32Array:
+    """Magnitude of the gradient of an image, per mm: where voxels are long, all edges across them count alike."""
+    spacing, values = image.grid.spacing_mm, fill_missing(image).values.astype(np.float32)
+    blur = np.maximum(_BLUR_MM / spacing, _LEAST_BLUR)
+    squared = np.zeros_like(values)
+    for edge, order in zip(spacing, np.eye(3, dtype=int), strict=True):
+        squared += (gaussian_filter(values, blur, order=order) / np.float32(edge)) ** 2
+    return np.sqrt(squared)
+
+
+def _sharpness(gradient: Float32Array, at: BoolArray, near: BoolArray) -> float:
     """Median of a gradient at a surface over that near it; 0 where no voxel is at or near it."""
     if not (at.any() and near.any()):
         return 0.0

@@ -1,6 +1,7 @@
 """`drive`: constitutive models under measured (Dirichlet) boundary conditions, without plate, contact and friction."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import fe
@@ -13,7 +14,7 @@ from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
 from mrstrain.models.simulate import material_sets
 from mrstrain.options.door import door
 from mrstrain.options.modelling import MaterialSets, MeshCoordinates
-from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
@@ -68,25 +69,28 @@ def drive(
     folders = {name: target / (name + ENDING) for name in laws}
     refuse_touching_inputs(target, [BOUNDARY, *(f.name for f in folders.values())], [place, Path(dvc)])
     make_output(target)
-    for folder in (target / BOUNDARY, *folders.values()):
-        make_output(folder)
-        fe.clear_simulation(folder)
     inputs = {"mesh": [place], "measured": [f for m in measurements for f in m.files]}
     inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
     record = provenance("drive", inputs, coordinates.plain())
-    for load, (nodes, u) in prescribed.items():
-        write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=unit, frame=frame)
     doubtful = [(m.load, m.verdict) for m in measurements if m.verdict and m.verdict.reasons]
     lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
     complete, regions = True, {str(n): region for n, region in enumerate(read.regions, start=1)}
-    for number, (name, (materials, notes)) in enumerate(laws.items()):
-        tell("drive", "simulating", number / len(laws))
-        outcome, messages = _drive_set(folders[name], read, materials, measured, threads or usable_cores())
-        complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
-        lines += messages
-        about = {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name}
-        about |= {"laws": {region: law.description for region, law in materials.items()}}
-        write_json(folders[name] / "simulation.json", about | record)
+    with ExitStack() as held_folders:
+        for folder in folders.values():  # not the boundary, which all sets of a study have in common
+            make_output(folder)
+            held_folders.enter_context(alone(folder))
+            fe.clear_simulation(folder)
+        make_output(target / BOUNDARY)
+        for load, (nodes, u) in prescribed.items():
+            write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=unit, frame=frame)
+        for number, (name, (materials, notes)) in enumerate(laws.items()):
+            tell("drive", "simulating", number / len(laws))
+            outcome, messages = _drive_set(folders[name], read, materials, measured, threads or usable_cores())
+            complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
+            lines += messages
+            about = {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name}
+            about |= {"laws": {region: law.description for region, law in materials.items()}}
+            write_json(folders[name] / "simulation.json", about | record)
     tell("drive", "simulating", 1.0)
     return Outcome(target, (*lines, f"Results: {target}"), complete)
 

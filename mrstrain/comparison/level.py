@@ -1,6 +1,7 @@
 """`level`: forward-model comparison (levelling), the measurement simulated on the displacement of a model."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from mrstrain.measurement.register import register
 from mrstrain.options import measurement as options
 from mrstrain.options.door import door
 from mrstrain.options.modelling import ModelReading
-from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.inputs import alone, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.measured_with import MeasuredWith
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import NOTE, OnProgress
@@ -44,7 +45,7 @@ def level(
     model, reading
         A folder with a file for each load, and how it is read; as in `compare`.
     out : path
-        Gets the folder MODEL-levelled, for `compare` in addition to the model itself, and the folder MODEL-work with
+        Gets the folder MODEL-levelled, for `compare` in addition to the model itself, and MODEL-levelled-work with
         the warped images and their registrations.
     subject_files, engine
         As in the registration of the measurement. A bone is needed; unknown elastix parameters are accepted.
@@ -84,20 +85,24 @@ def level(
     sources = {"models": [f.path for f in files.values()], "parameters": list(engine.parameters)}
     about = engine.model_dump(exclude={"parameters"}) | {"volume": volume} | seeded.plain()
     about |= {"bone_label": subject_files.bone_label} | reading.model_dump(exclude={"model_mesh"})
-    _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
-    work, failures = target / f"{name}-work", []
-    for load, result in results.items():
-        registered = work / "registered" / load  # separate folders, since a study runs several loads at the same time
-        try:
-            register.with_options(
-                load0, [work / "images" / f"{load}.nii.gz"], out=registered, subject_files=subject_files,
-                registration=how, scans=options.Scans(), onto=options.MeshAndAxes(),
-                running=options.Running(**dict(seeded)), progress=progress,
-            )  # fmt: skip
-        except (RegistrationError, WorkerError) as failed:
-            failures.append(f"{load} could not be registered: {failed}")
-        else:
-            _write(target / name / f"{load}.vtu", result.mesh, registered)
+    work, failures = target / f"{name}-work", list[str]()
+    make_output(work)
+    with ExitStack() as held_loads:  # not the folders, which all loads of a model have in common
+        for load in results:
+            held_loads.enter_context(alone(target / name / f"{load}.vtu", work / f".{load}.lock"))
+        _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
+        for load, result in results.items():
+            registered = work / "registered" / load  # of its own, since a study runs several loads at the same time
+            try:
+                register.with_options(
+                    load0, [work / "images" / f"{load}.nii.gz"], out=registered, subject_files=subject_files,
+                    registration=how, scans=options.Scans(), onto=options.MeshAndAxes(),
+                    running=options.Running(**dict(seeded)), progress=progress,
+                )  # fmt: skip
+            except (RegistrationError, WorkerError) as failed:
+                failures.append(f"{load} could not be registered: {failed}")
+            else:
+                _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
         raise RegistrationError("\n".join(failures))
     told = f"Levelled model, for compare: {target / name}"

@@ -8,7 +8,7 @@ from dvc.errors import InputError
 from mrstrain.measurement.case import Case, Series
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
-from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.inputs import alone, case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
 _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
@@ -63,4 +63,5 @@ def strain(
     refuse_touching_inputs(target, [name], [source, *subject.files.values()])
     measured = dvc.Measurement.from_deformation(total, subject, name=name)
     make_output(target)
-    return Series.of(target, (Case.of(measured, target / name, record),), {}, record)
+    with alone(target):
+        return Series.of(target, (Case.of(measured, target / name, record),), {}, record)

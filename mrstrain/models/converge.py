@@ -18,7 +18,7 @@ from mrstrain.models.simulate import LOADS, simulate
 from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
-from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import file_hash, provenance
 
@@ -95,31 +95,34 @@ def converge(
         raise InputError(f"The label map has no soft tissue '{region}'; it has {', '.join(known)}.")
     # an unsuitable material set is refused before hours of meshing
     material_set(material).for_regions([name for name in known if name not in bones])
-    places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
-    for edge, place in places.items():
-        if not _is_of(place, inputs, bones):
-            make_mesh.with_options(
-                labels, out=place, labelling=labelling, meshing=options.Meshing(edge_mm=edge),
-                watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
+    with alone(target):
+        places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
+        for edge, place in places.items():
+            if not _is_of(place, inputs, bones):
+                make_mesh.with_options(
+                    labels, out=place, labelling=labelling, meshing=options.Meshing(edge_mm=edge),
+                    watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
+                )  # fmt: skip
+        sizes = np.array([cell_size_mm(read_tet_mesh(place)) for place in places.values()])
+        extrapolate(sizes, sizes)  # refuses sizes that give no limit, before anything is simulated
+        values = []
+        for edge, place in places.items():
+            made = simulate.with_options(
+                place, out=target / f"simulated-{edge:g}", simulation=options.SimulationOptions(sets=(material,)),
+                loads=loads, plate_options=options.PlateOptions(**dict(directions)),
+                coordinates=options.MeshCoordinates(), cores=Cores(workers=workers),
+                progress=lambda case, stage, share, edge=edge: tell(f"{edge:g} mm, {case}", stage, share),  # type: ignore[misc]
             )  # fmt: skip
-    sizes = np.array([cell_size_mm(read_tet_mesh(place)) for place in places.values()])
-    extrapolate(sizes, sizes)  # refuses sizes that give no limit, before anything is simulated
-    values = []
-    for edge, place in places.items():
-        made = simulate.with_options(
-            place, out=target / f"simulated-{edge:g}", simulation=options.SimulationOptions(sets=(material,)),
-            loads=loads, plate_options=options.PlateOptions(**dict(directions)),
-            coordinates=options.MeshCoordinates(), cores=Cores(workers=workers),
-            progress=lambda case, stage, share, edge=edge: tell(f"{edge:g} mm, {case}", stage, share),  # type: ignore[misc]
-        )  # fmt: skip
-        if not made.complete:
-            reasons = " ".join(made.summary()[:-1])
-            raise MrstrainError(f"Not every load was reached on the mesh with an edge length of {edge:g} mm. {reasons}")
-        values.append(_followed(made.sets[0], region))
-    on_meshes = {key: tuple(of[key] for of in values) for key in values[0]}
-    rows = tuple(Row(*key, of, extrapolate(sizes, np.array(of))) for key, of in on_meshes.items())
-    done = Converged(target, tuple(sizes.tolist()), rows)
-    _write(done, edges, provenance("converge", inputs, {"edges_mm": edges, "material": material}))
+            if not made.complete:
+                reasons = " ".join(made.summary()[:-1])
+                raise MrstrainError(
+                    f"Not every load was reached on the mesh with an edge length of {edge:g} mm. {reasons}"
+                )
+            values.append(_followed(made.sets[0], region))
+        on_meshes = {key: tuple(of[key] for of in values) for key in values[0]}
+        rows = tuple(Row(*key, of, extrapolate(sizes, np.array(of))) for key, of in on_meshes.items())
+        done = Converged(target, tuple(sizes.tolist()), rows)
+        _write(done, edges, provenance("converge", inputs, {"edges_mm": edges, "material": material}))
     return done
 
 

@@ -10,7 +10,7 @@ from dvc.atomic_files import write_csv, write_json, write_whole
 from dvc.report.drawing import save_figure
 from fe import Fit, Material, Ogden, as_toml, figures, read_curves
 from fe.hyperelastic import OGDEN
-from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
 _FILES = ["fit.json", "fit.csv", "fit.png", "fit.pdf", "material.toml"]
@@ -108,16 +108,17 @@ def fit(
         "stable_where_measured": fitted.stable_where_measured,
         "provenance": provenance("fit", {"curve": path}, {"law": law, "test": test, "nu": nu, "tissue": tissue}),
     }
-    write_json(target / "fit.json", asdict(fitted) | about)
     rows = []
     for c in curves:
         modelled = 1000.0 * fitted.material.nominal_stress(c.stretch, c.mode)
         numbers = np.column_stack([c.stretch, 1000.0 * c.stress_mpa, modelled])
         rows += [[c.mode, *(f"{value:.8g}" for value in row)] for row in numbers]
-    write_csv(target / "fit.csv", ("test", "stretch", "nominal_stress_kpa", "fitted_kpa"), rows)
-    save_figure(target / "fit", figures.stress_stretch(curves, fitted))
     source = f"{law} fitted to {path.name}"
     if at_bound := [p.name for p in fitted.parameters if p.at_bound]:
         source += f", which does not determine {', '.join(at_bound)}"
-    write_whole(target / "material.toml", as_toml(path.stem, source, {tissue: fitted.material}))
+    with alone(target):
+        write_json(target / "fit.json", asdict(fitted) | about)
+        write_csv(target / "fit.csv", ("test", "stretch", "nominal_stress_kpa", "fitted_kpa"), rows)
+        save_figure(target / "fit", figures.stress_stretch(curves, fitted))
+        write_whole(target / "material.toml", as_toml(path.stem, source, {tissue: fitted.material}))
     return Fitted(target, fitted)

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 
 _OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
 # Distributions known to install a package with one of our names, and what else they are called.
@@ -30,6 +31,7 @@ _GIB = 1024**3
 _CONTAINER = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _LEAST_MEMORY_GIB = 6.0  # a pair of 256^3 images
 _LEAST_DISK_GIB = 2.0  # results of one loaded image of that size
+_SLOW_S = 60.0  # trials take seconds
 
 
 class ForeignPackageError(ImportError):
@@ -174,8 +176,12 @@ def _temporary() -> Finding:
 
 
 def _tried(what: str, trial: Callable[[], str]) -> Finding:
+    began = monotonic()
     try:
-        return Finding(f"trial of {what}", True, trial())
+        detail = trial()
     except Exception as error:  # must not end the examination
         advice = "The line above is the error of the trial. Reinstall mrstrain in an environment of its own."
         return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)
+    if (took_s := monotonic() - began) > _SLOW_S:
+        detail += f"; it took {took_s:.0f} s, which is slow: other programs may keep the machine busy"
+    return Finding(f"trial of {what}", True, detail)

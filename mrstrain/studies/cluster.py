@@ -34,6 +34,7 @@ _A_FAULT = "This is an error in mrstrain; please report it:\n"
 _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
+_NOTHING_LOGGED = logging.CRITICAL + 1  # by Dask, as of each message that there is no memory for: stages tell of theirs
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
 # A stage hangs that tells nothing new for this long, and for this many times what the rest of its study should take.
 _SILENT_S, _SILENT_TIMES = 3600.0, 10.0
@@ -268,8 +269,8 @@ class _ClosedIfRefused(Client):
 def _of_this_machine(workers: int) -> Iterator[tuple[LocalCluster, Client]]:
     """A cluster of processes of this machine, ended with the block however that ends."""
     local = LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=True, silence_logs=50, memory_limit=0, host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
+        n_workers=workers, threads_per_worker=1, processes=True, silence_logs=_NOTHING_LOGGED, memory_limit=0,
+        host="127.0.0.1", dashboard_address="127.0.0.1:0",
     )  # fmt: skip
     try:
         with Client(local) as client:

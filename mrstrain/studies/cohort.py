@@ -13,7 +13,7 @@ from dvc.own_files import read_rows
 from dvc.report.drawing import Drawing
 from dvc.report.page import Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
-from mrstrain.records.inputs import make_output
+from mrstrain.records.inputs import alone, make_output
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
@@ -90,12 +90,18 @@ def cohort(
     if len(ranges) > 1:
         raise InputError(f"The studies have different ranges of strain ([compare] strains): {sorted(ranges)}.")
     refuse_other_laws(read)
-    ran = run_studies(read, scheduler=scheduler, workers=workers, follower=Follower(progress))
-    by_name = dict(zip(names, ran, strict=True))
+    with alone(target):
+        ran = run_studies(read, scheduler=scheduler, workers=workers, follower=Follower(progress))
+        files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
+        return _ranked(dict(zip(names, ran, strict=True)), target, files)
+
+
+def _ranked(by_name: Mapping[str, StudyRun], target: Path, files: list[Path]) -> Cohort:
+    """Rank the models over the studies that ran, by the studies' names, and write tables, report and provenance."""
     without = {name: why for name, one in by_name.items() if (why := _uncounted(one))}
     areas = {name: _areas(one.study.out) for name, one in by_name.items() if name not in without}
     if not any(areas.values()):
-        lines = [line for one in ran for line in one.summary()]
+        lines = [line for one in by_name.values() for line in one.summary()]
         raise InputError(with_reasons("No subject was compared with a model.", lines))
     shares, notes = _shares(areas)
     notes = [f"{name} is left out: {why}" for name, why in without.items()] + notes
@@ -116,11 +122,10 @@ def cohort(
     rows_of_all = ([subject, *row.values()] for subject, rows in areas.items() for row in rows)
     write_csv(target / "cohort.csv", ["subject", *first], rows_of_all)
     write_csv(target / "ranking.csv", [f.name for f in fields(CohortRank)], map(astuple, ranking))
-    files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
-    write_json(target / PROVENANCE, record := provenance("cohort", {"studies": files}, {"subjects": names}))
+    write_json(target / PROVENANCE, record := provenance("cohort", {"studies": files}, {"subjects": list(by_name)}))
     sections = _sections(by_name, shares, ranking, notes, target)
     write_report(target / REPORT, "Models over subjects", None, sections, [], record_lines(record))
-    return Cohort(target, tuple(ran), ranking, tuple(notes))
+    return Cohort(target, tuple(by_name.values()), ranking, tuple(notes))
 
 
 def _uncounted(one: StudyRun) -> str:

@@ -1,9 +1,10 @@
 """What people see of a run while it goes on: progress with the time left, what each stage found, a growing report."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +22,7 @@ OnEnd = Callable[[Study, Mapping[str, StageOutcome]], object]
 _PAGE_EVERY_S = 3.0  # where something has changed
 _PAGE_AT_LEAST_EVERY_S = 60.0  # its time of day shows that the run goes on
 _UNENDED = 0.999  # of the whole: only what has ended is told as 1
+_warnings = logging.getLogger("mrstrain.studies")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +69,8 @@ class Report:
     def _show(self, on_page: Iterable[StageOutcome]) -> None:
         ran = [section for one in on_page if not one.reused for section in one.result.sections]
         if self.on_report is not None and any(section.pictures for section in ran):
-            self.on_report(self.path)
-            self.on_report = None
+            shown, self.on_report = self.on_report, None
+            shown(self.path)
 
 
 @dataclass(slots=True, eq=False)
@@ -82,6 +84,7 @@ class Watch:
     _lock: threading.RLock = field(default_factory=threading.RLock)
     _changed: set[str] = field(default_factory=set)  # prefixes of the studies whose page is out of date
     _stop: threading.Event = field(default_factory=threading.Event)
+    _warned: bool = False
 
     def tell(self, case: str, what: str, fraction: float) -> None:
         """Pass progress on."""
@@ -150,6 +153,7 @@ class Watch:
                     for name in self.left.under_way:
                         self._change(name)
                 changed, self._changed = self._changed, set()
+            with self._going_on("The progress could not be shown"), self._lock:
                 self._tell_all()  # stages that hang tell nothing
             self._write(changed)
 
@@ -158,5 +162,17 @@ class Watch:
             names, left_s = self.left.under_way, self.left.seconds()
         for prefix in prefixes:
             under_way = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
-            with suppress(OutputError):  # the run itself fails on a full disk, and says so
+            with self._going_on(f"{self.reports[prefix].path}: the report could not be renewed"):
                 self.reports[prefix].in_progress(under_way, left_s, interrupted=interrupted)
+
+    @contextmanager
+    def _going_on(self, failed: str) -> Iterator[None]:
+        """Let what people see of a run fail without the run; the first reason that nobody expects is logged."""
+        try:
+            yield
+        except OutputError:  # the run itself fails on a full disk, and says so
+            pass
+        except Exception as error:
+            if not self._warned:
+                self._warned = True
+                _warnings.warning("%s (%s: %s). The run goes on.", failed, type(error).__name__, error)

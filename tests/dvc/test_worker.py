@@ -13,6 +13,7 @@ from contextlib import suppress
 import numpy as np
 import psutil
 import pytest
+from loky import process_executor
 
 import dvc  # whose functions load when they are asked for: the processes of these tests import this file
 from dvc.errors import RegistrationError, WorkerError
@@ -109,6 +110,21 @@ def test_memory_that_runs_out_while_a_task_is_sent_is_lack_of_memory():
         with pytest.raises(WorkerError, match=r"memory ran out while aligning .*Free memory"):
             worker.run("aligning", len, [_TooLargeToSend()])
         assert worker.run("adding", sum, [1, 2]) == 3
+
+
+def _leaves_no_memory_for_anything() -> None:
+    def lacking(*_: object, **__: object) -> None:
+        raise MemoryError("not even to look at the memory")
+
+    process_executor._get_memory_usage = lacking  # what loky does after each task
+    raise MemoryError("of the task")
+
+
+def test_a_process_that_lacks_memory_after_its_task_ends_without_a_traceback(capfd):
+    with Worker(threads=1) as worker, pytest.raises(WorkerError, match=r"memory ran out while meshing \(of the task"):
+        worker.run("meshing", _leaves_no_memory_for_anything)
+    told = "".join(capfd.readouterr())
+    assert "Traceback" not in told, told
 
 
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])

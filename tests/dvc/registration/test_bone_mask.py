@@ -14,6 +14,7 @@ from dvc.measurement.subject import Subject
 from dvc.registration.bone_mask import mirrored_doubt
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Settings, register
+from phantoms import Heel, heel_grid, labels_of, scan
 
 
 def flipped(mask: Mask, *axes: int) -> Mask:
@@ -32,6 +33,35 @@ def test_a_mirrored_mask_is_told_with_its_axes(pair, axes, told, request):
     heel = request.getfixturevalue(pair)
     doubt = mirrored_doubt(heel.reference, flipped(heel.bone, *axes))
     assert f"mirrored along the {told} voxel axis" in doubt
+
+
+@pytest.fixture(scope="module", params=[0.8, 1.2, (0.8, 0.8, 2.4)], ids=["0.8", "1.2", "0.8x0.8x2.4"])
+def heel_at(request) -> tuple[Image, Mask]:
+    """One heel at several voxels, mm, and its bone."""
+    heel, grid = Heel(3), heel_grid(request.param)
+    return scan(heel, grid, snr=25.0, number=0), labels_of(heel, grid).region("bone")
+
+
+@pytest.mark.parametrize(
+    ("axes", "moved_mm", "told"),
+    [
+        ((), (0.0, 0.0, 0.0), ""),
+        ((), (0.0, 2.4, 0.0), ""),
+        ((), (0.0, 4.8, 0.0), ""),
+        ((0,), (0.0, 0.0, 0.0), "first"),
+        ((1,), (0.0, 0.0, 0.0), "second"),
+        ((2,), (0.0, 0.0, 0.0), "third"),
+        ((0, 1), (0.0, 0.0, 0.0), "first and second"),
+        ((0, 1), (0.0, 2.4, 0.0), "first and second"),
+    ],
+)
+def test_a_mask_is_judged_alike_at_any_voxels(heel_at, axes, moved_mm, told):
+    """With gradients per voxel, a mask mirrored along the first axis raised no doubt where voxels are long."""
+    image, bone = heel_at
+    steps = np.round(np.array(moved_mm) / bone.grid.spacing_mm).astype(int)
+    mask = Mask(bone.grid, np.roll(flipped(bone, *axes).inside, steps, (0, 1, 2)))
+    doubt = mirrored_doubt(image, mask)
+    assert (f"mirrored along the {told} voxel axis" in doubt) if told else (doubt == "")
 
 
 def test_noise_and_a_mask_at_the_ends_of_the_image_raise_no_doubt(tiny_pair):

@@ -9,9 +9,12 @@ from collections import namedtuple
 from importlib import import_module
 from importlib.metadata import requires
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from dvc.errors import MrstrainError
+from fe import meshing
 from mrstrain.records import doctor
 from mrstrain.records.doctor import Finding, examine
 
@@ -158,6 +161,25 @@ _ELASTIX = pytest.param("dvc.registration.elastix.run", marks=pytest.mark.full_s
 @pytest.mark.parametrize("module", [_ELASTIX, "fe.meshing", "fe.linear"])
 def test_what_it_tries_works_here(module: str) -> None:
     assert import_module(module).self_test()
+
+
+def test_a_busy_machine_is_slow_and_not_at_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside other programs, a mesh of seconds took more than a minute."""
+    now = [1000.0]
+
+    def meshed(_labels: object, _edge_mm: float, *, limit_s: float) -> tuple[None, SimpleNamespace]:
+        now[0] += 100.0
+        if limit_s < 100.0:
+            raise MrstrainError("Meshing was stopped at its time limit.")
+        return None, SimpleNamespace(cells=812)
+
+    monkeypatch.setattr(doctor, "monotonic", lambda: now[0])
+    monkeypatch.setattr(meshing, "mesh_labels", meshed)
+    quick = "pardiso solved 60 equations"
+    findings = by_name(examine(trials={"pytetwild": meshing.self_test, "sparse solver": lambda: quick}))
+    slow = "meshed a ball with 812 cells; it took 100 s, which is slow: other programs may keep the machine busy"
+    assert findings["trial of pytetwild"] == Finding("trial of pytetwild", True, slow)
+    assert findings["trial of sparse solver"].detail == quick
 
 
 def test_a_failed_registration_is_a_finding_and_not_an_exception(tmp_path: Path) -> None:

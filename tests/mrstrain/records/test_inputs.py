@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,6 @@ import pytest
 from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.images.image import Grid, Image
 from dvc.io.images.write import write_image
-from mrstrain import accuracy, phantom
 from mrstrain.measurement.register import register
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import (
@@ -26,7 +23,6 @@ from mrstrain.records.inputs import (
     refuse_touching_inputs,
 )
 from mrstrain.studies.run import run_studies
-from tests.phantoms.test_error_tables import CASE, samples
 
 
 def test_arguments_are_named_without_the_dashes_of_the_command_line(tmp_path: Path) -> None:
@@ -86,19 +82,3 @@ def test_a_damaged_matrix_is_refused_and_warns_of_nothing(tmp_path: Path, text: 
     (tmp_path / "m.txt").write_text(text)
     with pytest.raises(InputError, match=rf"m\.txt: .*{message}"):
         read_matrix(tmp_path / "m.txt")
-
-
-@pytest.mark.usefixtures("in_this_process")
-@pytest.mark.parametrize(
-    "second",
-    [partial(accuracy, cases=[CASE], workers=1), partial(phantom, seed=3, spacing_mm=4.0, loads=("Load1",))],
-    ids=["accuracy", "phantom"],
-)
-def test_a_second_command_in_one_folder_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, second: Callable[..., object]
-) -> None:
-    """Beside those of `tests/mrstrain/studies/test_run.py`, which need a study."""
-    monkeypatch.setattr("mrstrain.truth.accuracy.measure_run", lambda case, *_: samples(case))
-    with alone(tmp_path), pytest.raises(OutputError, match="another run writes to it"):
-        second(out=tmp_path)
-    assert list(tmp_path.iterdir()) == []

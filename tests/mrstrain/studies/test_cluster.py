@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import dask
 import psutil
 import pytest
+from distributed.protocol import ToPickle, dumps
 
 from dvc.errors import InputError
 from mrstrain.studies.cluster import _refuse_unencrypted, cluster
@@ -114,6 +115,25 @@ def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path)
         assert runner._client.submit(lost_once).result(timeout=300) == "done"
         kept = runner._client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_", "freed arrays serve the next")
         assert kept.result(timeout=300) == "freed arrays serve the next"
+
+
+def test_memory_that_a_worker_lacks_for_a_message_is_no_traceback(tmp_path, capfd):
+    """Its stage tells that the memory ran out; Dask told of each message, such as that the worker lives."""
+
+    def lacks_memory() -> None:
+        class TooLarge:
+            def __reduce__(self) -> str:
+                raise MemoryError("Unable to allocate internal buffer.")
+
+        with suppress(MemoryError):
+            dumps(ToPickle(TooLarge()))
+
+    with cluster(lambda *_: None, [tmp_path], workers=1) as runner:
+        runner._client.run(lacks_memory)
+        runner._client.run_on_scheduler(lacks_memory)
+        runner._client.run(lacks_memory, nanny=True)
+    told = "".join(capfd.readouterr())
+    assert "Traceback" not in told, told
 
 
 def test_what_runs_a_study_is_reached_from_this_machine_alone(tmp_path):

@@ -12,19 +12,15 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
-from filelock import FileLock
 
 from dvc.errors import OutputError
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image
-from fe import LoadStep
-from mrstrain import compare, mesh, register, simulate
 from mrstrain.studies.check import check
 from mrstrain.studies.file import read_study
 from mrstrain.studies.init import init
@@ -186,35 +182,6 @@ def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path)
     assert "register Load2: failed" in page
     for file in (out / "report.html", out / "study.log", out / "provenance.json", *(out / ".study").glob("*.*")):
         assert "Doe_Jane" not in file.read_text(), file
-
-
-def test_two_runs_in_one_folder(done):
-    folder, *_ = done
-    with FileLock(folder / "results" / ".study" / "lock"), pytest.raises(OutputError, match="another run"):
-        run(folder)
-
-
-def test_two_commands_in_one_folder(done, tmp_path):
-    """Whatever writes to a folder, a second that would is refused, and what is there stays."""
-    folder, *_ = done
-    for name in ("registered", "compared", "models/akrami"):
-        (tmp_path / name).mkdir(parents=True)
-    results, labels = folder / "results", {"labels": folder / "tissues.nii.gz", "names": folder / "tissues.csv"}
-    images, to_mesh = [folder / f"Load{n}.nii.gz" for n in range(2)], folder / "to_mesh.nii.gz"
-    load, plate = LoadStep("Load1", 1.0), {"plate_normal": (-1.0, 0.0, 0.0), "shear_direction": (0.0, 1.0, 0.0)}
-    made = {one: tmp_path / one for one in ("registered", "m.vtu", "models", "compared")}
-    for lock, second in {
-        "registered/.mrstrain-lock": partial(register, images[0], images[1:], out=made["registered"], align="image"),
-        ".m.vtu.lock": partial(mesh, to_mesh, names=folder / "to_mesh.csv", out=made["m.vtu"], edge_mm=9.0),
-        "models/akrami/.mrstrain-lock": partial(
-            simulate, results / "mesh" / "mesh.vtu", out=made["models"], sets=["akrami"], loads=[load], **plate
-        ),
-        "compared/.mrstrain-lock": partial(
-            compare, results / "registration", [results / "models" / "akrami"], out=made["compared"], **labels
-        ),
-    }.items():
-        with FileLock(tmp_path / lock), pytest.raises(OutputError, match="another run writes to it"):
-            second()
 
 
 def without_loads(done: Path, study: Path, loads: tuple[str, ...] = ("Load1", "Load2")) -> Path:

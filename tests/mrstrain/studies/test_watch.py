@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -135,6 +137,62 @@ def test_a_report_that_cannot_be_written_stops_nothing(seen: Seen) -> None:
         seen.path.rmdir()
         seen.end("mesh", StageResult((), headline="35,000 tetrahedra"))
         assert states(seen.page_with("35,000"))["mesh"] == ("done", "35,000 tetrahedra")
+
+
+class Once:
+    """A part of the run's picture that fails the first time, as nobody expects."""
+
+    def __init__(self, then: Callable[..., object]) -> None:
+        self.calls, self.then = 0, then
+
+    def __call__(self, *given: object, **more: object) -> object:
+        self.calls += 1
+        if self.calls == 1:
+            raise ValueError("no such column")
+        return self.then(*given, **more)
+
+
+def test_a_page_whose_writing_fails_once_is_written_next_time_and_the_reason_is_told(
+    seen: Seen, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    failing = Once(watching.write_page_in_progress)
+    monkeypatch.setattr(watching, "write_page_in_progress", failing)
+    with seen.watch.reporting():
+        seen.end("register Load1", MEASURED)
+        wait_for(lambda: failing.calls > 0)
+        seen.end("mesh", StageResult((), headline="35,000 tetrahedra"))
+        wait_for(lambda: failing.calls > 1, limit_s=60.0)
+        assert states(seen.page_with("35,000"))["mesh"] == ("done", "35,000 tetrahedra")
+    (told,) = caplog.messages
+    assert str(seen.path) in told
+    assert "ValueError: no such column" in told
+    assert "The run goes on" in told
+
+
+@pytest.mark.parametrize("part", ["progress", "on_report"])
+def test_what_is_called_and_fails_does_not_leave_the_page_old(
+    seen: Seen, caplog: pytest.LogCaptureFixture, part: str
+) -> None:
+    failing = Once(lambda *_: None)
+    if part == "progress":
+        seen.watch.follower = replace(seen.watch.follower, progress=failing)
+    else:
+        seen.watch.reports[""].on_report = failing
+    seen.pipeline.outcomes["register Load1"] = StageOutcome("register Load1", record("register Load1", MEASURED))
+    seen.watch._change("register Load1")
+    with seen.watch.reporting():
+        wait_for(lambda: failing.calls > 0)
+        seen.pipeline.outcomes["mesh"] = StageOutcome("mesh", record("mesh", StageResult((), headline="35,000 cells")))
+        seen.watch._change("mesh")
+        wait_for(lambda: seen.path.is_file() and "35,000" in seen.path.read_text(), limit_s=20.0)
+    assert "no such column" in caplog.text
+
+
+def test_an_interrupt_stays_one_where_its_page_cannot_be_written(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watching, "_PAGE_EVERY_S", 60.0)
+    monkeypatch.setattr(watching, "write_page_in_progress", Once(watching.write_page_in_progress))
+    with pytest.raises(KeyboardInterrupt), seen.watch.reporting():
+        raise KeyboardInterrupt
 
 
 def test_progress_tells_what_was_found_once_and_the_share_of_the_time(seen: Seen) -> None:
