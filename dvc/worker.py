@@ -139,7 +139,7 @@ class Worker(AbstractContextManager["Worker", None]):
     def _running(self) -> ProcessPoolExecutor:
         """The child process, started where there is none."""
         if self._killed:
-            raise WorkerError("The process was ended before its task began.")
+            raise WorkerError("The process was ended before its task began. Run the command again.")
         if self._executor is None:
             count = str(self.threads)
             names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")

@@ -76,7 +76,7 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     place = Path(path)
     read = read_mesh(place, unit=unit, frame=frame)
     if read.tets is None:
-        raise InputError(f"{place}: simulations need tetrahedra, and this mesh has cells of other shapes.")
+        raise InputError(f"{place}: simulations need tetrahedra, and this mesh has other cells. Mesh it again.")
     names: dict[str, str] = {}
     names_file = place.with_suffix(".json")
     if names_file.is_file():
@@ -84,7 +84,8 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
             table = read_json(names_file)["regions"]
             names = {f"region {number}": str(name) for number, name in table.items()}
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
-            raise InputError(f"{names_file}: the table of region names is missing or damaged ({damaged}).") from damaged
+            what = f"the table of region names is missing or damaged ({damaged})"
+            raise InputError(f"{names_file}: {what}. Copy it again, or mesh again.") from damaged
     mesh = read.tets
     regions, count = {names.get(name, name): cells for name, cells in mesh.regions.items()}, len(mesh.cells)
     regions = _without(regions, {name for name, cells in regions.items() if len(cells) == count}, count)

@@ -231,7 +231,9 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
                 "Positive values press, against the plate's outward normal."
             )
         if load.sheared and not plate.taped:
-            raise InputError(f"{load.name}: a plate without friction cannot apply shear; got {load}.")
+            raise InputError(
+                f"{load.name}: a plate without friction cannot apply shear; got {load}. Let the skin stick."
+            )
 
 
 def _unusual(mesh: TetMesh, materials: Materials, plate: Plate, load: LoadStep) -> str:

@@ -37,7 +37,7 @@ def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     except (OSError, ValueError, LookupError, TypeError, AttributeError, StopIteration) as failure:
         raise InputError(
             f"{place}: not the folder of a simulation, or a file in it is damaged ({type(failure).__name__}: "
-            f"{failure}). It needs {RECORD}, curve.csv and a VTU file for each load, as written by `mrstrain simulate`."
+            f"{failure}). Give a folder with {RECORD}, curve.csv and a VTU file for each load, of `mrstrain simulate`."
         ) from failure
 
 
@@ -57,7 +57,7 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
         still = (u_mm[faces] == 0.0).all(axis=(1, 2))
         mesh = TetMesh(first.points, cells, regions, {bone: faces[still], SKIN: faces[~still]})
     elif not (np.array_equal(mesh.points_mm, first.points) and np.array_equal(mesh.cells, cells)):
-        raise InputError(f"{place}: this simulation was made on another mesh than the one given.")
+        raise InputError(f"{place}: this simulation was made on another mesh than the one given. Give that mesh.")
     undeformed = first, np.zeros_like(first.points), np.zeros((len(cells), 3, 3)), np.zeros(len(cells))
     skin, states = np.unique(mesh.facets[SKIN]), []
     for name, at in outcome.items():  # no file: the time limit was reached before the first equilibrium

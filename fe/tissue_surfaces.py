@@ -41,7 +41,7 @@ def borders_of(labels: LabelMap) -> Borders:
     image["labels"] = labels.labels.astype(np.int32).ravel(order="F")
     net = image.contour_labels("all", output_mesh_type="triangles", smoothing=False)  # closed at the image's edge
     if not net.n_cells:
-        raise MrstrainError("The label map is empty: it has no surface or interface to mesh.")
+        raise MrstrainError("The label map is empty: it has no surface or interface to mesh. Choose another file.")
     made = net.smooth_taubin(
         n_iter=_PASSES, pass_band=_PASS_BAND, non_manifold_smoothing=True, normalize_coordinates=True
     )

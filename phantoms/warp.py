@@ -98,7 +98,7 @@ def synthetic_warp(
     Buades, Coll and Morel, CVPR 2005, doi:10.1109/CVPR.2005.38 (non-local means).
     """
     if not tissue.grid.same_as(reference.grid) or not tissue.inside.any():
-        raise InputError("The tissue mask is empty, or on another grid than the unloaded image.")
+        raise InputError("The tissue mask is empty, or on another grid than the unloaded image. Give another mask.")
     grid, near = acquisition.grid or reference.grid, near or RigidMotion.identity()
     shown = _shown(tissue, motion, grid)
     sigma = noise_sd(reference, tissue)

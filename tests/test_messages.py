@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,12 @@ HOLE = "x" * 12
 """Stands for what a message takes from the data: a path, a number, a name."""
 LONGEST, LINES = 300, 3
 DEEPEST = 6  # of what a text is made from
+BROKEN = re.compile(r"damaged|incomplete|diverged|no such file|is empty")
+STEP = re.compile(
+    r"\b(export|copy|check|register|write|run|give|save|choose|start|use|restore|delete|compare|pass|look|repair|add)\b",
+    re.IGNORECASE,
+)
+"""What a person can do next."""
 LIST = f":\n{HOLE}"  # choices may follow below a message, a line for each
 TEXTS = ("InputError", "ImageFileError")  # returned by functions that make an error
 
@@ -125,6 +132,18 @@ def test_no_error_is_longer_than_three_lines() -> None:
         if len(text) > LONGEST or len(wrapped(text).splitlines()) > LINES
     ]
     assert not long, "\n" + "\n".join(long)
+
+
+def test_what_is_damaged_missing_or_diverged_comes_with_a_next_step() -> None:
+    """The messages of a chain of causes end where they are raised again, by a hole."""
+    without = [
+        f"{place}: {message}"
+        for place, message in messages()
+        if BROKEN.search(message) and not STEP.search(message) and not message.endswith(HOLE)
+    ]
+    assert not without, "\n" + "\n".join(without)
+    assert BROKEN.search("the header is damaged.")
+    assert not STEP.search("the header is damaged.")
 
 
 def test_a_message_is_taken_together_from_its_parts() -> None:

@@ -202,13 +202,15 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
     try:
         numbers = np.array([[float(row[c]) for c in columns] for _, row in rows]).reshape(-1, 4)
     except ValueError as error:
-        raise InputError(f"{place}: a row does not have a node and three numbers ({error}).") from error
+        raise InputError(
+            f"{place}: a row does not have a node and three numbers ({error}). Export it again."
+        ) from error
     index = {int(n): i for i, n in enumerate(source.node_ids)}
     ids = numbers[:, 0].tolist()
     unknown = [n for n in ids if n not in index]
     if unknown or len(set(ids)) < len(ids):
         what = f"node {unknown[0]:.15g}, which {source.path.name} does not have" if unknown else "a node twice"
-        raise InputError(f"{place} has {what}; table and mesh do not match.")
+        raise InputError(f"{place} has {what}; table and mesh do not match. Export both from one model.")
     u = np.full((len(source.node_ids), 3), np.nan)
     u[[index[n] for n in ids]] = numbers[:, 1:]
     return u

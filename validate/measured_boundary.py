@@ -59,7 +59,7 @@ def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArra
     if (far := np.count_nonzero(distance > _FAR_MM)) > _FEW * len(u):
         raise InputError(
             f"The measurement does not cover the model: {far} of {len(u)} nodes are over {_FAR_MM:g} mm away from the "
-            "measured tissue."
+            "measured tissue. Check the unit and frame of the mesh."
         )
     u = filled_from_nearest(u, mesh.points_mm)
     if BONE in mesh.facets:

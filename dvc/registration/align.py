@@ -114,7 +114,9 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     like the bone, if the contrast is inverted, or if the fits of two halves disagree by more than 0.5 mm.
     """
     if not mask.inside.any():
-        raise InputError("The mask for the rigid alignment is empty.")
+        raise InputError(
+            "The mask for the rigid alignment is empty. Choose another mask, or align on the image (--align image)."
+        )
     fit, likeness = RigidFit(reference, loaded, mask, seed), _Likeness(reference, loaded, mask)
     starts, highest = _search(reference, loaded, mask)
     score, best = _best(fit, likeness, [*starts, RigidMotion.identity()])

@@ -257,7 +257,7 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
         if not given.grid.same_as(reference.grid):
             raise InputError(f"The {name} is not on the grid of the unloaded image; resample it with fit_mask.")
         if not (given.labels if isinstance(given, LabelMap) else given.inside).any():
-            raise InputError(f"The {name} is empty.")
+            raise InputError(f"The {name} is empty: all voxels are 0. Choose another file.")
     if bone is not None and (share := float(np.mean(bone.inside[body.inside]))) > _MOSTLY_BONE:
         raise InputError(
             f"The bone mask covers {share:.0%} of the body, so there is no soft tissue to measure. Check that bone "

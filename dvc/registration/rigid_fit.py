@@ -81,7 +81,7 @@ class RigidFit:
             raise InputError("The unloaded image is a single slice; the rigid alignment needs a volume.")
         if len(points) < _LEAST_VOXELS:
             shown = f"Only {len(points)} voxels of the mask are in the unloaded image"
-            raise InputError(f"{shown}; the rigid alignment needs at least {_LEAST_VOXELS}.")
+            raise InputError(f"{shown}; the rigid alignment needs at least {_LEAST_VOXELS}. Check the mask.")
         self._centre = points.mean(axis=0)
         self._radius_mm = float(np.sqrt(np.mean(np.sum((points - self._centre) ** 2, axis=1))))
         self._block_mm = max(min(_BLOCK_MM, _BLOCK_SHARE * self._radius_mm), float(mask.grid.spacing_mm.max()))

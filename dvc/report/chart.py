@@ -55,13 +55,14 @@ def number_axes(axes: Axes) -> None:
 
 
 def legend(axes: Axes, *, loc: Any = "best", **where: Any) -> None:
-    """Give a panel its legend, if anything in it has a label.
+    """Give a panel its legend, if anything in it has a label; lines beneath it are hardly seen.
 
     With a place that is asked for, if only "best", matplotlib does not warn where a busy machine takes a second for it.
     """
     if axes.get_legend_handles_labels()[0]:
         font = FontProperties(family=FAMILY, size=SMALL_PT)
-        axes.legend(prop=font, labelcolor=INK, frameon=False, loc=loc, **where)
+        ground = {"facecolor": "white", "edgecolor": "none", "framealpha": 0.9}
+        axes.legend(prop=font, labelcolor=INK, loc=loc, **ground, **where)
 
 
 def colour_bar(axes: Axes, mapped: ScalarMappable, label: str, extend: str = "neither") -> None:

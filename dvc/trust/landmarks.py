@@ -182,7 +182,7 @@ def _from_fcsv(path: Path) -> _Points:
         cells = next(csv.reader([text]), [])
         if len(cells) < len(columns):
             count = f"{len(cells)} of {len(columns)} columns"
-            raise ImageFileError(f"{path}, line {line}: the row has {count}; the file is incomplete.")
+            raise ImageFileError(f"{path}, line {line}: the row has {count}. Save the list again in Slicer.")
         row = dict(zip(columns, cells, strict=False))
         position = np.array([_number(f"{path}, line {line}", axis, row.get(axis)) for axis in "xyz"])
         points.append((row.get("label") or str(len(points) + 1), position * _TO_LPS[frame]))

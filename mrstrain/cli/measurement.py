@@ -31,7 +31,7 @@ def label(
     out: Annotated[Path, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.")], masks: BoneAndBody,
     strokes: Marks,
 ) -> None:  # fmt: skip
-    """Make a label map of skin, fat, muscle and bones from the unloaded image and its bone, or a few marks."""
+    """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks."""
     from mrstrain.records.progress import live
 
     with live() as progress:

@@ -80,7 +80,7 @@ def compare(
         ),
     ] = None,
 ) -> None:  # fmt: skip
-    """Compare FE models of any code with a measurement: strain-volume curves, areas, location, agreement; a report."""
+    """Compare FE models of any code with a measurement: strain-volume curves, area metric, location, agreement."""
     from mrstrain.records.inputs import read_matrix
 
     matrix = None if to_image is None else read_matrix(to_image)
@@ -132,7 +132,7 @@ def converge(
     labelling: modelling.Labelling, directions: modelling.Directions, followed: modelling.Followed, load: Loads = None,
     workers: Workers = None,
 ) -> None:  # fmt: skip
-    """Mesh convergence: the same loads on several edge lengths, and the limits of strain and plate displacement."""
+    """Mesh convergence: simulate the same loads at several edge lengths, and extrapolate to an infinitely fine mesh."""
     from mrstrain.models.simulate import loads_named
 
     carry_out(

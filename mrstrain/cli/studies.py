@@ -17,7 +17,7 @@ NoOpen = Annotated[
     bool,
     typer.Option(
         "--no-open",
-        help="Do not open the report in a browser. By default it opens at its first picture, if there is a display.",
+        help="Do not open the report in a browser. By default it opens with its first picture, if there is a display.",
         envvar="MRSTRAIN_NO_OPEN",
         rich_help_panel="Output",
     ),
@@ -49,7 +49,7 @@ def init(
 ) -> None:
     """Write a commented study file for the contents of a folder, and a picture of them.
 
-    In a terminal, asks what the files do not tell: the bone, the forces and the plate's directions.
+    In a terminal, asks for what the files do not contain: the bone, the forces and the plate's directions.
     """
     if yes or not (sys.stdin.isatty() and sys.stdout.isatty()):
         tell(mrstrain.init(folder, name=name))
@@ -113,7 +113,7 @@ def cohort(
     studies: Annotated[list[Path], typer.Argument(help="Study files, or their folders.")], out: Out,
     scheduler: Scheduler = None, workers: Workers = None,
 ) -> None:  # fmt: skip
-    """Run the studies of several subjects on one cluster: one table, one report, models ranked over all subjects."""
+    """Run the studies of several subjects, and rank the models over all of them in one table and one report."""
     _carry_out(mrstrain.cohort, studies, out=out, scheduler=scheduler, workers=workers)
 
 
@@ -131,7 +131,7 @@ def demo(
     workers: Workers = None,
     no_open: NoOpen = False,
 ) -> None:
-    """Run a whole study on a heel phantom with known strain under four loads: error by tissue, and a report."""
+    """Run a whole study on a heel phantom with known strain under four loads, and report the error by tissue."""
     from mrstrain.studies.demo import demo as run
 
     on_report = None if no_open or not can_open() else show

@@ -61,7 +61,7 @@ def model_files(
         if not chosen:
             lacking = f"no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}"
             if len(models) == 1:
-                raise InputError(f"{place} has {lacking}.")
+                raise InputError(f"{place} has {lacking}. Name each file after its load.")
             notes.append(f"{name} has {lacking}; it is left out.")
             continue
         taken.append(name)
@@ -100,7 +100,8 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
         }
         return place.resolve().name, files
     if not place.is_file():
-        raise InputError(f"{place}: no such file or folder; a model is a folder with a file for each load, or a file.")
+        kinds = "a model is a folder with a file for each load, or a file"
+        raise InputError(f"{place}: no such file or folder. Check the path: {kinds}.")
     if place.stem in loads:
         return place.parent.resolve().name, {place.stem: place}
     if len(loads) > 1:

@@ -94,7 +94,10 @@ def simulate(
     chosen = material_sets(sets)
     towards = dict(towards or {})
     if strangers := towards.keys() - {load.name for load in loads}:
-        raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, but there is no such load.")
+        known = ", ".join(load.name for load in loads)
+        raise InputError(
+            f"Directions are given for {', '.join(sorted(strangers))}, which is no load; the loads are {known}."
+        )
     usual = (plate_options.plate_normal, plate_options.shear_direction)
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
     plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}
@@ -168,7 +171,7 @@ def material_sets(names: Sequence[str]) -> list[fe.MaterialSet]:
     """Material sets by published name or file; at least one is needed, each only once."""
     chosen = [fe.material_set(name) for name in names]
     if not chosen:
-        raise InputError("At least one material set is needed.")
+        raise InputError("At least one material set (sets) is needed, such as trebbi.")
     if twice := clash(one.name for one in chosen):
         raise InputError(f"Two material sets are named {twice}; give each only once, or rename one.")
     return chosen

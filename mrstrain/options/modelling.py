@@ -35,10 +35,11 @@ class ComparisonLabels(Options):
     labels: Path | None = None
     """Label map of the unloaded image. Default: that of the measurement, with its names and bone."""
     names: Path | None = None
-    """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, without --labels."""
+    """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, unless --labels is given."""
     bones: Annotated[Names, Cli("--bone")] = ()
     """Name of a bone label, which is not compared; slices in figures go through the lowest point of the first bone.
-    Default: the bone label of the measurement, without --labels; else every label that is named like a bone."""
+    Default: the bone label of the measurement. With --labels, or without that label: every label that is named like
+    a bone."""
 
 
 class Finer(NamedTuple):

@@ -107,9 +107,10 @@ def accuracy(
     make_output(target)
     at_once = max(1, min(workers or usable_cores(), len(missing)))
     if tell_plan is not None:
+        minutes = max(expected_minutes(missing, at_once), 1.0) if missing else 0.0
         tell_plan(
-            f"Registrations to run: {len(missing)}, {at_once} at a time, in about "
-            f"{expected_minutes(missing, at_once):.0f} min; already done: {len(wanted) - len(missing)}."
+            f"Registrations to run: {len(missing)}, {at_once} at a time, in about {minutes:.0f} min; "
+            f"already done: {len(wanted) - len(missing)}."
         )
     with alone(target):
         folder.mkdir(exist_ok=True)

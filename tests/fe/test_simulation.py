@@ -143,7 +143,7 @@ def test_its_plot_has_a_panel_for_each_load(simulation: fe.Simulation) -> None:
 
 def test_what_is_no_simulation_is_refused(simulation: fe.Simulation, tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"not the folder of a simulation.*needs simulation\.json, curve\.csv and a VTU"
+        InputError, match=r"not the folder of a simulation.*folder with simulation\.json, curve\.csv and a VTU"
     ):
         fe.Simulation.read(tmp_path)
     simulation.write(tmp_path)

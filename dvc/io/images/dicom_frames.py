@@ -172,13 +172,16 @@ def _build_frame(path: Path, header: Any, number: int | None, own: dict[str, Any
     slope, intercept = (float(usual if own[name] is None else own[name]) for name, usual in _SCALING.items())
     which = "" if number is None else f", frame {number}"
     if not np.isfinite([*axes.ravel(), *position, row_spacing, column_spacing, slope, intercept]).all():
-        raise ImageFileError(f"{path}{which}: the DICOM header is damaged (values that are not finite).")
+        raise ImageFileError(
+            f"{path}{which}: the DICOM header is damaged (values that are not finite). Export it again."
+        )
     if abs(axes[0] @ axes[1]) > _SAME_DIRECTION or np.abs(np.linalg.norm(axes, axis=1) - 1).max() > _SAME_DIRECTION:
-        raise ImageFileError(f"{path}{which}: the header is damaged (row and column directions not perpendicular).")
+        damage = "row and column directions not perpendicular"
+        raise ImageFileError(f"{path}{which}: the header is damaged ({damage}). Export it again.")
     columns, rows = int(header.Columns), int(header.Rows)
     if min(row_spacing, column_spacing) <= 0 or min(columns, rows) < 1:
         voxels = f"{columns} x {rows} voxels of {column_spacing:g} x {row_spacing:g} mm"
-        raise ImageFileError(f"{path}{which}: {voxels}; all must be positive. The header is damaged.")
+        raise ImageFileError(f"{path}{which}: {voxels}; all must be positive. The header is damaged. Export it again.")
     echo_ms = None if own["EchoTime"] is None else round(float(own["EchoTime"]), 2)
     echo = tuple(str(int(e)) for e in _several(own["EchoNumbers"]))
     image_type = "/".join(map(str, own["ImageType"]))
@@ -320,5 +323,6 @@ def _decoded_by_itk(path: Path, header: Any, numbers: list[int], count: int) -> 
             pydicom.dcmwrite(one, bare, enforce_file_format=True)
             values = sitk.GetArrayFromImage(sitk.ReadImage(str(one)))
             if values.shape != (1, int(header.Rows), int(header.Columns)):
-                raise ImageFileError(f"{path}: the file is damaged (pixels and header differ in image size).")
+                damage = "pixels and header differ in image size"
+                raise ImageFileError(f"{path}: the file is damaged ({damage}). Export it again.")
             yield values[0]

@@ -122,7 +122,7 @@ def read_names(path: StrPath) -> dict[int, str]:
     names: dict[int, str] = {}
     for value, name in filter(None, rows):
         if value in names:
-            raise InputError(f"{place}: label {value} has two names, '{names[value]}' and '{name}'.")
+            raise InputError(f"{place}: label {value} has two names, '{names[value]}' and '{name}'. Keep one.")
         if value != 0:
             names[value] = name
     return names
@@ -186,7 +186,8 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     fitted: Any = _nearest(own, values, grid)
     left = np.count_nonzero(fitted) * grid.voxel_volume_mm3
     if left == 0:
-        raise GeometryError(f"{what}: no voxel is left after resampling to the grid of the image. {boxes}")
+        resampled = "no voxel is left after resampling to the grid of the image"
+        raise GeometryError(f"{what}: {resampled}. {boxes} Export it again from the image on which it was drawn.")
     before = total * own.voxel_volume_mm3
     change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL; {100 * share:.0f} % of it is inside the image"
     _log.warning("%s: on another grid than the image; resampled by nearest neighbour (%s). %s", what, change, boxes)

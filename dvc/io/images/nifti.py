@@ -109,7 +109,9 @@ def _number_type(path: Path, header: Any) -> np.dtype[Any]:
     try:
         dtype: np.dtype[Any] = np.dtype(header.get_data_dtype())
     except KeyError:
-        raise ImageFileError(f"{path}: unknown NIfTI data type {code}; the header is damaged.") from None
+        raise ImageFileError(
+            f"{path}: unknown NIfTI data type {code}; the header is damaged. Export it again."
+        ) from None
     if dtype.kind not in "iuf" or dtype.itemsize > 8 or dtype.itemsize < 1:
         problem = f"colour and complex images are not supported (NIfTI data type {code})"
         raise ImageFileError(f"{path}: {problem}. Save the magnitude image.")
@@ -137,7 +139,9 @@ def _ras_affine(path: Path, header: Any, shape: tuple[int, int, int]) -> FloatAr
         )
     for name, affines in (("qform", qforms), ("sform", sforms)):
         if not np.isfinite(affines).all():
-            raise ImageFileError(f"{path}: the {name} has values that are not finite; the header is damaged.")
+            raise ImageFileError(
+                f"{path}: the {name} has values that are not finite (header damaged). Export it again."
+            )
     if qforms and sforms:
         _refuse_disagreement(path, qforms, sforms[0], shape)
     return (sforms or qforms)[0]  # a full matrix holds its digits better than a quaternion
@@ -155,7 +159,7 @@ def _qforms(path: Path, header: Any) -> list[FloatArray]:
     b, c, d = (float(header[f"quatern_{name}"]) for name in "bcd")
     rest = 1.0 - (b * b + c * c + d * d)
     if not rest > -1e-4:
-        raise ImageFileError(f"{path}: the qform's quaternion is not a rotation; the header is damaged.")
+        raise ImageFileError(f"{path}: the qform's quaternion is not a rotation (header damaged). Export it again.")
     nominal = rest if rest >= _HALF_TURN else 0.0  # as the standard's own reader takes it
     least, most = np.sqrt(max(rest - _ROUNDING, 0.0)), np.sqrt(max(rest + _ROUNDING, 0.0))
     sizes = np.abs(np.float64(header["pixdim"][1:4]))

@@ -65,7 +65,7 @@ def read_image(
     finite = np.isfinite(values)
     missing = values.size - int(np.count_nonzero(finite))
     if missing == values.size:
-        raise ImageFileError(f"{path}: no voxel has a finite value.")
+        raise ImageFileError(f"{path}: no voxel has a finite value. Export the image again.")
     if missing:
         first = tuple(map(int, np.unravel_index(int(np.argmin(finite)), values.shape)))
         problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"

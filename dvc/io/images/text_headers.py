@@ -51,7 +51,7 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
         raise ImageFileError(f"{path}: not an NRRD file (it does not start with NRRD). Export it again.")
     end = re.search(rb"\r?\n\r?\n", start)
     if end is None and path.stat().st_size >= _HEADER_LIMIT:
-        raise ImageFileError(f"{path}: the NRRD header has no end; the file is damaged.")
+        raise ImageFileError(f"{path}: the NRRD header has no end; the file is damaged. Export it again.")
     text = start[: end.start() if end else len(start)].decode("utf-8", errors="replace")
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}
@@ -65,7 +65,8 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
             name, value = line.split(":", 1)
             fields[name.strip().lower()] = value.strip()
         else:
-            raise ImageFileError(f"{path}: the NRRD header is damaged; this line is not a field: '{line[:60]}'.")
+            what = f"this line is not a field: '{line[:60]}'"
+            raise ImageFileError(f"{path}: the NRRD header is damaged; {what}. Export it again.")
     return fields, pairs, end.end() if end else len(start)
 
 
@@ -74,7 +75,9 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     fields, _, end = nrrd_fields(path)
     sizes = _whole_numbers(path, fields, "sizes")
     if _whole_numbers(path, fields, "dimension") != [len(sizes)]:
-        raise ImageFileError(f"{path}: the header is damaged ({len(sizes)} sizes, {fields['dimension']} dimensions).")
+        raise ImageFileError(
+            f"{path}: {len(sizes)} sizes, {fields['dimension']} dimensions (header damaged). Export it again."
+        )
     if len(sizes) < 3:
         raise ImageFileError(
             f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed. Give all slices in one file."
@@ -102,10 +105,14 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     if "endian" not in fields and _NRRD_TYPES[kind][1] != "1":
         raise ImageFileError(f"{path}: the NRRD header does not give the byte order (endian); save it again.")
     if order not in ("little", "big"):
-        raise ImageFileError(f"{path}: the header is damaged (endian is '{order}', neither little nor big).")
+        raise ImageFileError(
+            f"{path}: the header is damaged (endian is '{order}', neither little nor big). Export it again."
+        )
     units = fields.get("space units", "")
     if not re.fullmatch(r'("[^"]*"\s*)*', units):
-        raise ImageFileError(f"{path}: the header is damaged ('space units' are not quoted words: '{units[:60]}').")
+        raise ImageFileError(
+            f"{path}: 'space units' are not quoted words: '{units[:60]}' (header damaged). Export it again."
+        )
     unit = _unit_of_length(path, {unit.strip().lower() for unit in re.findall(r'"([^"]*)"', units)})
     to_lps_mm = np.array(_TO_LPS[fields["space"].lower()]) * _MM_PER_UNIT[unit]
     columns = np.stack([*axes.values()], axis=1) * to_lps_mm[:, None]
@@ -149,7 +156,9 @@ def _steps(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
             f"{'given' if written else 'none'}). Supported spaces: {sorted(_TO_LPS)}."
         )
     if not re.fullmatch(r"((none|\([^()]*\))\s*)+", written):
-        raise ImageFileError(f"{path}: the header is damaged ('space directions' are not vectors: '{written[:60]}').")
+        raise ImageFileError(
+            f"{path}: 'space directions' are not vectors: '{written[:60]}' (header damaged). Export it again."
+        )
     items = re.findall(r"none|\([^()]*\)", written)
     return [None if item == "none" else _vector(path, item, "space directions") for item in items]
 
@@ -212,7 +221,7 @@ def _meta_fields(path: Path) -> tuple[dict[str, str], int]:
     damaged = [line for line in lines if "=" not in line]
     if damaged:
         line = f"this line is not a field: '{damaged[0][:60]}'"
-        raise ImageFileError(f"{path}: the MetaImage header is damaged; {line}.")
+        raise ImageFileError(f"{path}: the MetaImage header is damaged; {line}. Export it again.")
     pairs = (line.split("=", 1) for line in lines)
     return {name.strip().lower(): value.strip() for name, value in pairs}, last.end()
 
@@ -228,7 +237,9 @@ def _needed(path: Path, fields: Mapping[str, str], names: tuple[str, ...], count
 def _truth(path: Path, fields: Mapping[str, str], name: str, default: bool) -> bool:
     word = fields.get(name, str(default)).lower()
     if word not in ("true", "t", "1", "false", "f", "0"):
-        raise ImageFileError(f"{path}: the header is damaged ('{name}' is '{word}', neither True nor False).")
+        raise ImageFileError(
+            f"{path}: the header is damaged ('{name}' is '{word}', neither True nor False). Export it again."
+        )
     return word in ("true", "t", "1")
 
 
@@ -255,7 +266,9 @@ def _numbers_in(path: Path, text: str, field: str, count: int | None = None) -> 
 def _whole_numbers(path: Path, fields: Mapping[str, str], field: str) -> list[int]:
     found = _numbers_in(path, fields.get(field, ""), field)
     if not all(n.is_integer() and abs(n) < _LARGEST_SIZE for n in found):
-        raise ImageFileError(f"{path}: the header is damaged ('{field}' must be whole numbers; got {found}).")
+        raise ImageFileError(
+            f"{path}: the header is damaged ('{field}' must be whole numbers; got {found}). Export it again."
+        )
     return [int(n) for n in found]
 
 

@@ -150,7 +150,7 @@ def _add_elements(where: str, keyword: Keyword, mesh: NumberedMesh) -> list[int]
     if len(numbers) % (width + 1):
         raise ImageFileError(
             f"{where}: {kind} elements need {width + 1} numbers each, but {len(numbers)} is not a multiple of that. "
-            "The file may be incomplete."
+            "The file may be incomplete. Export it again."
         )
     rows = [numbers[i : i + width + 1] for i in range(0, len(numbers), width + 1)]
     for number, *nodes in rows:

@@ -84,7 +84,9 @@ def _rows(path: Path, lines: Iterator[tuple[int, str]], block: str) -> list[str]
         if line.startswith(" -3"):
             return rows
         rows.append(line)
-    raise ImageFileError(f"{path}: the file is incomplete; it ends within the {block}.")
+    raise ImageFileError(
+        f"{path}: the file is incomplete; it ends within the {block}. Copy it again, or run CalculiX again."
+    )
 
 
 def _counted(head: str, rows: list[str]) -> list[str]:

@@ -51,7 +51,7 @@ def read_xplt(path: Path) -> RawMesh:
     with damage_named(f"{path}: its sections"):
         data = path.read_bytes()
         if len(data) < 4 or struct.unpack_from("<I", data)[0] != _MAGIC:
-            raise ImageFileError(f"{path}: not a FEBio plot file.")
+            raise ImageFileError(f"{path}: not a FEBio plot file. Give the .xplt file that FEBio wrote.")
         last: dict[int, bytes] = {}
         before = b""  # the state before the last one
         for tag, body in _sections(data):
@@ -60,7 +60,7 @@ def read_xplt(path: Path) -> RawMesh:
             before = last.get(tag, b"") if tag == _STATE else before
             last[tag] = body
         if _ROOT not in last or _MESH not in last:
-            raise ImageFileError(f"{path}: the file is incomplete; it has no mesh.")
+            raise ImageFileError(f"{path}: the file is incomplete; it has no mesh. Copy it again, or run FEBio again.")
         points, ids = _nodes(last[_MESH])
         fields = _displacement(last[_ROOT], last[_STATE], len(points)) if _STATE in last else {}
         _tell_iterations(path, before, last.get(_STATE, b""))

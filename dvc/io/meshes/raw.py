@@ -57,18 +57,18 @@ class NumberedMesh:
     def add_node(self, number: int, coordinates: list[float]) -> None:
         """Add a node; refuse a number that is taken, or that no program gives."""
         if not 0 < number <= _HIGHEST:
-            raise ImageFileError(f"{self.path}: {number} cannot be the number of a node. The file is damaged.")
+            raise ImageFileError(f"{self.path}: {number} cannot be the number of a node. Export the mesh again.")
         if number in self.nodes:
-            raise ImageFileError(f"{self.path}: node {number} is defined twice.")
+            raise ImageFileError(f"{self.path}: node {number} is defined twice. Export the mesh again.")
         self.nodes[number] = coordinates
 
     def add_element(self, number: int, kind: str, nodes: list[int]) -> None:
         """Add an element, its kind in meshio's names; refuse a number that is taken and a wrong count of nodes."""
         if number in self.elements:
-            raise ImageFileError(f"{self.path}: element {number} is defined twice.")
+            raise ImageFileError(f"{self.path}: element {number} is defined twice. Export the mesh again.")
         if len(nodes) != num_nodes_per_cell[kind]:
             counts = f"{len(nodes)} nodes, but a {kind} needs {num_nodes_per_cell[kind]}"
-            raise ImageFileError(f"{self.path}: element {number} has {counts}. The file is damaged.")
+            raise ImageFileError(f"{self.path}: element {number} has {counts}. Export the mesh again.")
         self.elements[number] = kind, nodes
 
     def by_index(
@@ -150,4 +150,4 @@ def damage_named(place: str) -> Iterator[None]:
     except ImageFileError:
         raise
     except _DAMAGE as error:
-        raise ImageFileError(f"{place} cannot be read ({error}); the file is damaged.") from error
+        raise ImageFileError(f"{place} cannot be read ({error}); the file is damaged. Export it again.") from error

@@ -138,7 +138,7 @@ def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFil
     if path.suffix.lower() not in _READERS:
         raise InputError(f"{path}: the name of a mesh file must end in {', '.join(_READERS)}; got {path.suffix!r}.")
     if not path.is_file():
-        raise ImageFileError(f"{path}: no such file.")
+        raise ImageFileError(f"{path}: no such file. Check the path.")
     try:
         return _checked(_READERS[path.suffix.lower()](path), unit, frame)
     except (GeometryError, InputError) as error:

@@ -56,7 +56,7 @@ def read_gmsh(path: Path) -> RawMesh:
     with _names_apart(path, names) as (place, real), _BoundedFile(place) as file:
         mesh = _read(path, lambda _: gmsh.read_buffer(file))
     if len(tags) != len(mesh.points):
-        raise ImageFileError(f"{path}: {len(tags)} node numbers for {len(mesh.points)} nodes; the file is damaged.")
+        raise ImageFileError(f"{path}: {len(tags)} node numbers for {len(mesh.points)} nodes. Export the mesh again.")
     blocks = [(c.type, c.data[:, _TO_VTK[c.type]] if c.type in _TO_VTK else c.data) for c in mesh.cells]
     sizes = [len(data) for _, data in blocks]
     groups: list[tuple[str, IntArray]] = []
@@ -69,7 +69,7 @@ def read_gmsh(path: Path) -> RawMesh:
     for name, parts in mesh.cell_sets.items():  # version 4.1, where a cell may be in several groups
         if not name.startswith("gmsh:"):
             if len(parts) != len(starts):
-                raise ImageFileError(f"{path}: the $Elements section is incomplete.")
+                raise ImageFileError(f"{path}: the $Elements section is incomplete. Export the mesh again.")
             own = [np.asarray(part, dtype=np.int64) + start for part, start in zip(parts, starts, strict=True)]
             groups.append((real.get(name, name), np.concatenate(own)))
     regions: dict[str, IntArray] = {}
@@ -114,7 +114,9 @@ def _node_numbers(path: Path) -> IntArray:
     tags: IntArray = _read(path, lambda _: read_tags(path, data, mode == b"0", int(size)))
     if len(np.unique(tags)) != len(tags):
         different = len(np.unique(tags))
-        raise ImageFileError(f"{path}: {different} different node numbers for {len(tags)} nodes; the file is damaged.")
+        raise ImageFileError(
+            f"{path}: {different} different node numbers for {len(tags)} nodes. Export the mesh again."
+        )
     if len(tags) and not 0 < tags.min() <= tags.max() <= _HIGHEST_NUMBER:
         raise ImageFileError(
             f"{path}: nodes have numbers from {tags.min()} to {tags.max()}, and only 1 to {_HIGHEST_NUMBER} are "
@@ -215,7 +217,7 @@ def _refuse_a_grid_too_large(path: Path) -> None:
     grid = _GRID.search(path.read_bytes())
     if grid and math.prod(map(int, grid.groups())) > path.stat().st_size:
         size = " x ".join(number.decode() for number in grid.groups())
-        raise ImageFileError(f"{path}: the file is too short for a grid of {size} points. It is damaged or incomplete.")
+        raise ImageFileError(f"{path}: the file is too short for a grid of {size} points. Export it again.")
 
 
 def _read(path: Path, read: Callable[[str], Any]) -> Any:

@@ -27,7 +27,9 @@ def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
             continue
         shown = line if len(line) < 80 else line[:77] + "..."
         if not line.isprintable():
-            raise ParameterError(f"line {number}: {shown!r} has characters that are no text. The file is damaged.")
+            raise ParameterError(
+                f"line {number}: {shown!r} has characters that are no text. Copy or write the file again."
+            )
         if not (line.startswith("(") and line.endswith(")")):
             raise ParameterError(f"line {number}: '{shown}' is not in brackets; write (Name value ...).")
         pieces = line[1:-1].split('"')

@@ -123,7 +123,7 @@ def _refuse_incomplete(stored: list[_Stored]) -> None:
         if parameters is None or fixed is None:
             raise InputError(f"the file is incomplete: the {name[1]} lacks numbers. Copy or export it again.")
         if not (np.isfinite(parameters).all() and np.isfinite(fixed).all()):
-            raise InputError(f"the {name[1]} has numbers that are not finite. The file is damaged.")
+            raise InputError(f"the {name[1]} has numbers that are not finite. Copy or export the file again.")
         if name[1] in _ON_A_GRID:
             sizes = fixed[:3]
             whole = len(fixed) == 18 and np.all((sizes >= 1) & (sizes == np.floor(sizes)))
@@ -186,7 +186,7 @@ def _from_sitk(transform: Any) -> Deformation:
         images = [image_from_sitk(image) for image in transform.GetCoefficientImages()]
         coefficients = np.stack([values for _, values in images]).astype(np.float64, copy=False)
         if not np.isfinite(coefficients).all():
-            raise InputError("the B-spline has coefficients that are not finite. The file is damaged.")
+            raise InputError("the B-spline has coefficients that are not finite. Copy or export the file again.")
         return BSpline(images[0][0], coefficients)
     if isinstance(transform, sitk.DisplacementFieldTransform):
         grid, u = image_from_sitk(transform.GetDisplacementField())

@@ -232,7 +232,9 @@ def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
     if kind == "File":
         named = path.parent / _word(parameters, "TransformFileName", "")
         if not named.is_file():
-            raise InputError(f"{path}: the ITK transform file '{named.name}' (TransformFileName) is missing.")
+            raise InputError(
+                f"{path}: the ITK transform file '{named.name}' (TransformFileName) is missing. Copy it there."
+            )
         return read_itk_transform(named)
     _require(parameters, tuple(_ELASTIX))
     ignored = _word(parameters, "UseDirectionCosines", "true") == "false" and "Direction" in parameters
@@ -243,7 +245,9 @@ def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
         )
     made = _ELASTIX[kind](parameters)
     if isinstance(made, BSpline) and not np.isfinite(made.coefficients_mm).all():
-        raise ParameterError("TransformParameters are not all finite: the registration diverged.")
+        raise ParameterError(
+            "TransformParameters are not all finite: the registration diverged. Register again with smaller steps."
+        )
     return made
 
 

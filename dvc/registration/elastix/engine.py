@@ -156,7 +156,8 @@ def _one_stage(
     tell(1.0)
     bspline = bspline_from_elastix(found)
     if not np.isfinite(bspline.coefficients_mm).all():
-        raise RegistrationError(f"{preset.name}: the elastix optimiser diverged (coefficients are not finite).")
+        what = "the elastix optimiser diverged (coefficients are not finite)"
+        raise RegistrationError(f"{preset.name}: {what}. Use a preset, or set a smaller MaximumStepLength.")
     return bspline.plus(start) if start is not None else bspline
 
 

@@ -201,7 +201,10 @@ def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:
     """Both images over the brightness of the tissue in the fixed one; InputError if that is not above zero."""
     scale = float(np.nanpercentile(pair.fixed.values[pair.body.inside], 75))
     if not scale > 0:
-        raise InputError("The unloaded image is zero or negative in most of the tissue; intensities must be positive.")
+        raise InputError(
+            "The unloaded image is zero or negative in most of the tissue; intensities must be positive. Check the "
+            "tissue mask (tissue), and export the magnitude image."
+        )
     fixed, moving = (Image(image.grid, image.values / np.float32(scale)) for image in (pair.fixed, pair.moving))
     return fixed, moving
 
@@ -228,7 +231,9 @@ def spline_through(deformation: Deformation, control: Grid) -> FloatArray:
     u = deformation.displacement(control.points().reshape(-1, 3)).reshape(*control.shape, 3)
     unknown = ~np.isfinite(u).all(axis=-1)
     if unknown.all():
-        raise InputError("The start deformation (start) is not defined anywhere in the unloaded image.")
+        raise InputError(
+            "The start deformation (start) is not defined anywhere in the unloaded image. Check start_frame."
+        )
     if unknown.any():
         to = distance_transform_edt(unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True)
         u = u[tuple(to)]

@@ -27,6 +27,7 @@ _SMALLEST = 1e-6
 _ON_DIAGONAL = [0, 3, 5]  # xx, yy, zz
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
 _FLATTEST = 0.1  # det F below this is taken as this in F^-T
+_DIVERGED = "Check both images and the masks, or start from the result of a smaller load (chain)."
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,7 @@ class Level:
         F, cofactor, J, pulled = strained(self.pair.blocks.evaluate(coefficients)[1])
         images = self.pair.normal(coefficients, pulled, halves)
         if images.count == 0 or not np.isfinite(images.square) or (halves >= 0 and np.isnan(images.left_out)):
-            raise RegistrationError("The registration diverged: the two images no longer overlap.")
+            raise RegistrationError(f"The registration diverged: the two images no longer overlap. {_DIVERGED}")
         bent = self.roughness.product(coefficients)
         if self.rest is not None:
             bent -= self.roughness.held(self.rest)
@@ -196,7 +197,7 @@ class Level:
             before = energy(state)
             step = self.step(state, weights, variance, _SOLVER if state.halves < 0 else _SOLVER_OF_HALF)
             if not np.isfinite(step).all():
-                raise RegistrationError("The registration diverged: a step is not finite.")
+                raise RegistrationError(f"The registration diverged: a step is not finite. {_DIVERGED}")
             moved = self.pair.blocks.evaluate(step)[0]
             # Air, and tissue that no image shows, may go where it likes; tissue not where the energy then rises.
             tissue = (self._soft > 0) | self._resists

@@ -167,7 +167,7 @@ def test_a_list_of_slicer_that_is_cut_in_a_line_is_refused(tmp_path: Path) -> No
     with pytest.raises(InputError, match=r"a\.fcsv: the file may be incomplete: it ends in the middle of a line"):
         read_landmarks((path, path))
     path.write_text(text.rpartition(",")[0] + "\n")
-    with pytest.raises(ImageFileError, match=r"a\.fcsv, line 6: the row has 13 of 14 columns; the file is incomplete"):
+    with pytest.raises(ImageFileError, match=r"a\.fcsv, line 6: the row has 13 of 14 columns. Save the list again"):
         read_landmarks((path, path))
 
 

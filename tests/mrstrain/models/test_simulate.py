@@ -303,7 +303,7 @@ def test_a_load_may_go_in_directions_of_its_own(mesh_file: Path, tmp_path: Path)
     told = told["outcome"]
     assert np.array(told["aside"]["plate_axes_lps"])[:, 1].tolist() == [0.0, 0.0, -1.0]
     assert np.array(told["forth"]["plate_axes_lps"])[:, 1].tolist() == [0.0, 1.0, 0.0]
-    with pytest.raises(InputError, match="Load9, but there is no such load"):
+    with pytest.raises(InputError, match="Load9, which is no load; the loads are "):
         run(mesh_file, out=tmp_path / "no", loads=loads, **plate, towards={"Load9": aside})
 
 

@@ -1,0 +1,208 @@
+"""The page of an accuracy study: the errors at its usual condition first, then every table, folded."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from operator import attrgetter
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from dvc.registration.engines import DEFAULT
+from dvc.report.drawing import Drawing
+from dvc.report.page import Cell, Picture, Section, Table
+from dvc.trust.error_model import POOLED
+from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wavelength_recovered
+
+_R = TypeVar("_R", ErrorRow, ResolutionRow)
+_Condition = tuple[str, str, float]
+_USUAL = (DEFAULT, "0.8", 25.0)
+"""Preset, voxel size (mm) and SNR that a page begins with, or the condition of the study that shares most of them."""
+_TISSUES = ("fat", "muscle", "skin")
+_CONDITION = ("preset", "voxel, mm", "SNR")
+_PLACES = {
+    "error_by_strain": "true maximum shear strain",
+    "error_by_distance_to_bone": "distance to bone, mm",
+    "error_by_distance_to_interface": "distance to a border, mm",
+}
+"""Stems of the files of figures, and what the errors are shown by there; the first stands on the first screen."""
+_OF_ANSWER = (
+    "Max. shear: maximum shear strain (E₁ − E₃)/2 (Green-Lagrange), no unit. Error: measured minus true, over all "
+    "motions with strain (RMSE: root mean square error). Noise floor: max. shear measured between two unloaded scans."
+)
+_OF_ERRORS = (
+    "Error: measured minus true maximum shear strain (SD: standard deviation, RMSE: root mean square, p95: 95th "
+    "percentile of its magnitude). u: displacement; its error in mm."
+)
+_OF_FLOOR = (
+    "MAER is the mean over voxels of the mean absolute value of the six strain components; SDER is its standard "
+    "deviation over voxels."
+)
+HOW_TO_READ = Section(
+    "How to read this",
+    paragraphs=(
+        "Every pair is a synthetic heel whose strain is known at every point. The error is measured minus true: of the "
+        "maximum shear strain (E1 - E3)/2 (Green-Lagrange), and of the displacement of tissue relative to its bone, at "
+        "one in eight of the heel's voxels.",
+        "Motions: still (rigid foot motion only), smooth (a smooth flow), sliding (the fat pad slides between "
+        "constrained bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as "
+        "strong as under the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength "
+        "L mm). Labels +1 or -1: bones and skin are one voxel too large, or too small, in the label map that the "
+        "registration was given.",
+        "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. A finer resolution "
+        "means more noise, so report both.",
+        "Bias and SD in the error model are conditional on the measured shear. They apply to tissue strained and "
+        "imaged like these phantoms; scanner distortion and creep during a scan are not included.",
+    ),
+)
+
+
+def sections_of(
+    errors: Sequence[ErrorRow], floors: Sequence[FloorRow], resolution: Sequence[ResolutionRow],
+    coverage: Sequence[CoverageRow], failures: Mapping[str, str], folder: Path,
+) -> list[Section]:  # fmt: skip
+    """Sections of the page: the answer, then all else, folded. Their figures are written to a folder."""
+    by_condition = {of[0].condition: of for of, _ in _by_condition(errors, floors)}
+    pictures = {condition: _pictures(condition, rows, folder) for condition, rows in by_condition.items()}
+    answer, others = [], []
+    if by_condition:
+        usual = max(by_condition, key=lambda one: [part == wanted for part, wanted in zip(one, _USUAL, strict=True)])
+        answer = [_answer(usual, by_condition, floors, tuple(pictures[usual][:1]))]
+        pictures[usual] = pictures[usual][1:]
+    for rows, still in _by_condition(errors, floors):
+        others.append(_condition_section(rows, still, pictures[rows[0].condition]))
+    if resolution:
+        others.append(_resolution_section(floors, resolution, folder))
+    if coverage:
+        others.append(_coverage_section(coverage))
+    if failures:
+        others.append(Section("Failed cases", tables=(Table("Failures", ("case", "reason"), tuple(failures.items())),)))
+    return [*answer, *(replace(section, folded=bool(answer)) for section in others)]
+
+
+def _answer(
+    usual: _Condition, by_condition: Mapping[_Condition, Sequence[ErrorRow]], floors: Sequence[FloorRow],
+    pictures: tuple[Picture, ...],
+) -> Section:  # fmt: skip
+    """A sentence, the figure of errors and a row for each tissue at one condition, then a row for each condition."""
+    still = {floor.tissue: (floor.shear_p50, floor.shear_p95) for floor in floors if floor.condition == usual}
+    errors = {tissue: _over_motions(by_condition[usual], tissue) for tissue in _TISSUES}
+    rows = tuple(
+        (t, *map(_told, (*errors[t][:2], *still.get(t, (None, None)), errors[t][2])))
+        for t in _TISSUES
+        if errors[t][0] is not None or t in still
+    )
+    columns = ("tissue", "error: RMSE", "bias", "noise floor: median", "p95", "displacement error: RMSE, mm")
+    tables = [Table("Error of the max. shear by tissue", columns, rows, _OF_ANSWER)]
+    if len(by_condition) > 1:
+        every = tuple(
+            (*one, *(_told(_over_motions(of, tissue)[0]) for tissue in _TISSUES)) for one, of in by_condition.items()
+        )
+        tables.append(Table("RMSE of the max. shear by condition", (*_CONDITION, *_TISSUES), every))
+    return Section(
+        "Error of the maximum shear strain", tables=tuple(tables), pictures=pictures,
+        paragraphs=(_sentence(usual, rows),), pictures_first=True,
+    )  # fmt: skip
+
+
+def _sentence(condition: _Condition, rows: Sequence[tuple[Cell, ...]]) -> str:
+    """The error and the noise floor of each tissue in one sentence, from the rows of the answer's table."""
+    preset, voxel, snr = condition
+    error, floor = (
+        _listed([f"{row[column]:.3f} in {row[0]}" for row in rows if row[column] is not None]) for column in (1, 3)
+    )
+    told = [f"the max. shear has an error (RMSE) of {error}"] if error else []
+    told += [f"the noise floor (median) is {floor}"] if floor else []
+    return f"With {preset}, voxels of {voxel} mm and SNR {snr:g}, {'; '.join(told)}."
+
+
+def _listed(items: Sequence[str]) -> str:
+    """Items in a sentence: "a, b and c"."""
+    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
+
+
+def _over_motions(rows: Sequence[ErrorRow], tissue: str) -> tuple[float | None, float | None, float | None]:
+    """RMSE and bias of the max. shear and RMSE of the displacement (mm) in a tissue, over all motions with strain."""
+    of = [row for row in rows if row.tissue == tissue and row.by == "all" and row.motion != "still"]
+    if not of:
+        return None, None, None
+    values = np.array([(row.shear_rmse**2, row.shear_bias, row.u_rmse_mm**2) for row in of])
+    shear, bias, u = np.average(values, axis=0, weights=[row.samples for row in of])
+    return float(np.sqrt(shear)), float(bias), float(np.sqrt(u))
+
+
+def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tuple[list[_R], list[FloorRow]]]:
+    """Rows of one condition, and its noise floor."""
+    for condition in dict.fromkeys(r.condition for r in rows):
+        yield [r for r in rows if r.condition == condition], [f for f in floors if f.condition == condition]
+
+
+def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], pictures: Sequence[Picture]) -> Section:
+    head = ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95")
+    values = attrgetter(
+        "tissue", "true_p50", "true_p95", "shear_bias", "shear_sd", "shear_rmse", "shear_p95", "u_rmse_mm", "u_p95_mm"
+    )
+    labels = {off: f", labels {off:+d}" if off else "" for off in {r.labels_off for r in errors}}
+    rows = tuple((r.motion + labels[r.labels_off], *map(_told, values(r))) for r in errors if r.by == "all")
+    tables = [Table("Error by motion and tissue", head, rows, _OF_ERRORS)]
+    if floors:
+        of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
+        floor = attrgetter("tissue", "maer", "sder", "shear_p50", "shear_p95")
+        noise = tuple(tuple(map(_told, floor(f))) for f in floors)
+        tables.append(Table("Noise floor: apparent strain between two unloaded scans", of_floor, noise, _OF_FLOOR))
+    preset, voxel, snr = errors[0].condition
+    title = f"By motion and tissue: {preset}, voxels of {voxel} mm, SNR {snr:g}"
+    return Section(title, tables=tuple(tables), pictures=tuple(pictures), pictures_first=True)
+
+
+def _pictures(condition: _Condition, errors: Sequence[ErrorRow], folder: Path) -> list[Picture]:
+    """Figures of one condition, written to a folder; none of errors in too few samples."""
+    preset, voxel, snr = condition
+    pictures = []
+    for stem, by in _PLACES.items():
+        if not (pooled := figures.pooled_errors(errors, by)):
+            continue
+        columns = (by.replace(", mm", "_mm").replace(" ", "_"), "max_shear_rmse", "max_shear_bias")
+        data = dict(zip(("tissue", *columns), zip(*pooled, strict=True), strict=True))
+        title = f"Error by {figures.words(by).split(',')[0]}"
+        drawing = Drawing.of(title, figures.errors_by_place, pooled, by, data=data)
+        where = f"{Path(preset).stem}_{voxel.replace(' ', '')}mm_snr{snr:g}"
+        pictures.append(drawing.save(folder / f"{stem}_{where}"))
+    return pictures
+
+
+def _told(cell: Cell) -> Cell:
+    """A strain, or a length in mm, to three decimals: what is smaller is of no interest."""
+    return round(cell, 3) if isinstance(cell, float) else cell
+
+
+def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
+    table = Table(
+        "Coverage of the error model",
+        (*_CONDITION, "motion", "tissue", "voxels covered, %", "remaining error, mean", "figures covered, %"),
+        tuple(
+            (*r.condition, r.motion, r.tissue, 100 * r.voxels_within, r.left_over, 100 * r.figures_within) for r in rows
+        ),
+        "Each heel is compared with a model fitted to the other heels under the same motions. Voxels covered: truth "
+        "within 1.96 SD; 95 % if the model is correct. Figures covered: percentiles and volumes of the tissue within "
+        "the intervals that `register` would give.",
+    )
+    return Section("Validation of the error model", tables=(table,))
+
+
+def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], folder: Path) -> Section:
+    table_rows = []
+    for of_condition, still in _by_condition(rows, floors):
+        noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == POOLED), (None, None, None))
+        wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
+        table_rows.append((*of_condition[0].condition, *wavelengths, *noise))
+    columns = (*_CONDITION, "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
+    drawings = {"resolution": Drawing.of("Spatial resolution", figures.resolution, rows)}
+    if known := figures.noise_and_resolution(floors, rows, POOLED):
+        names = ("condition", "wavelength_recovered_to_90_percent_mm", "max_shear_without_load")
+        data = dict(zip(names, zip(*known, strict=True), strict=True))
+        drawing = Drawing.of("Noise against resolution", figures.trade_off, known, POOLED, data=data)
+        drawings["noise_and_resolution"] = drawing
+    pictures = [drawing.save(folder / stem) for stem, drawing in drawings.items()]
+    table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows), _OF_FLOOR)
+    return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))
