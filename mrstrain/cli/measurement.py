@@ -11,6 +11,7 @@ from mrstrain.cli.lines import say
 from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
 from mrstrain.options.measurement import (
     BoneAndBody,
+    DrawnLabels,
     Marks,
     MeshAndAxes,
     RegistrationOptions,
@@ -29,14 +30,14 @@ SliceSpacing = Annotated[
 def label(
     load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, enhanced DICOM, or a DICOM folder.")],
     out: Annotated[Path, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.")], masks: BoneAndBody,
-    strokes: Marks,
+    strokes: Marks, drawn: DrawnLabels,
 ) -> None:  # fmt: skip
     """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks."""
     from mrstrain.records.progress import live
 
     with live() as progress:
         done = mrstrain.label.with_options(
-            load0, out=out, masks=masks, strokes=strokes, watch=partial(progress, "label", "tissues")
+            load0, out=out, masks=masks, strokes=strokes, drawn=drawn, watch=partial(progress, "label", "tissues")
         )
     tell(done)
 

@@ -38,6 +38,18 @@ class Marks(Options):
     """Table of the names of the marks: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon."""
 
 
+class DrawnLabels(Options):
+    """A label map of the unloaded image that was drawn, to be corrected."""
+
+    panel: ClassVar[str] = "Inputs"
+
+    labels: Path | None = None
+    """Label map to correct, instead of --bone and --marks: the borders of its bones and skin move to where the image
+    shows them, by up to 2.5 voxels."""
+    names: Path | None = None
+    """Table of its label names: ITK-SNAP, Slicer or CSV."""
+
+
 class SubjectFiles(BoneAndBody):
     """What is known of the unloaded image: its bone, body and tissues."""
 

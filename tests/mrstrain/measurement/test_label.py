@@ -17,7 +17,7 @@ from dvc.measurement.subject import LabelsFromImage
 from mrstrain.measurement.label import read_marks
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import made_from_image, read_subject
-from phantoms import Heel, heel_grid, labels_of, scan
+from phantoms import Heel, heel_grid, labels_of, misdrawn, scan
 
 
 @pytest.fixture(scope="module")
@@ -119,3 +119,30 @@ def test_an_image_without_a_dark_surface_says_so(folder: Path, tmp_path: Path) -
     assert any("No skin was found" in line for line in told)
     assert any("One tissue was found" in line for line in told)
     assert set(read_labels(tmp_path / "t.nii.gz", tmp_path / "t.csv").names.values()) == {"bone", "fat"}
+
+
+def test_a_drawn_label_map_is_corrected_and_its_files_agree(folder: Path, tmp_path: Path) -> None:
+    load0, drawn = folder / "Load0.nii.gz", tmp_path / "drawn.nii.gz"
+    truth = labels_of(Heel(41), read_image(load0).grid)
+    write_labels(drawn, misdrawn(truth, 1))
+    names = tmp_path / "drawn.csv"
+    told = mrstrain.label(load0, labels=drawn, names=names, out=tmp_path / "out" / "tissues.nii.gz").summary()
+    made = read_labels(tmp_path / "out" / "tissues.nii.gz", tmp_path / "out" / "tissues.csv")
+    wrong = [np.mean(of.labels != truth.labels) for of in (made, misdrawn(truth, 1))]
+    assert wrong[0] < 0.5 * wrong[1]
+    record = json.loads((tmp_path / "out" / "tissues.json").read_text())
+    assert record["changed"] == np.mean((made.labels != misdrawn(truth, 1).labels)[truth.labels > 0])
+    assert record["moved"]["bone"]["mean_mm"] < -0.5
+    assert told[0].startswith(f"{100 * record['changed']:.1f} % of the voxels have another label")
+    assert f"bone {record['moved']['bone']['mean_mm']:+.2f}" in told[1]
+    assert (tmp_path / "out" / "tissues.png").is_file()
+    assert made_from_image(tmp_path / "out" / "tissues.nii.gz") is None  # it is the user's
+
+
+def test_what_is_corrected_needs_no_mask_and_names_need_labels(folder: Path, tmp_path: Path) -> None:
+    load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "t.nii.gz"
+    with pytest.raises(InputError, match="give it without masks or marks"):
+        mrstrain.label(load0, labels=bone, bone=bone, out=out)
+    with pytest.raises(InputError, match="names are those of a label map"):
+        mrstrain.label(load0, bone=bone, names=tmp_path / "names.csv", out=out)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,168 @@
+"""Borders of bones and skin in a label map that was drawn, moved to where the image shows them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label, maximum
+from skimage.segmentation import watershed
+
+from dvc.arguments import checked
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from dvc.errors import InputError
+from dvc.images.bias_field import without_bias_field
+from dvc.images.depth import depth_mm
+from dvc.images.image import Image, LabelMap, Mask
+from dvc.images.resample import fill_missing
+from dvc.labelling.skin import Skin
+from dvc.measurement.subject import is_bones_name
+
+_REACH = 2.5  # voxels, of a border that is moved
+_BLUR_MM = 0.4
+_AROUND_MM = 3.0  # standard deviation of the neighbourhood whose brightness is compared with that of a rim
+_DARK_PERCENT = 5.0  # of the voxels near a border of bone: as dark as its rim
+_EDGE = 0.4  # of the step from rim to soft tissue: the rim's darkest voxels still show some of what is beside it
+_RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are smaller
+_ONE_VOXEL = 1.05
+_LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no border
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedLabels:
+    """A label map with corrected borders.
+
+    Attributes
+    ----------
+    labels : LabelMap
+        On the image's grid; the outline of the body, and borders between soft tissues, are as given.
+    changed : float
+        Share of the labelled voxels that have another label.
+    moved_mm : mapping
+        Mean and root mean square of how far the borders of "bone" and "skin" moved, mm, by name: above zero where the
+        bone grew, or the skin became thicker.
+    notes : tuple of str
+        What was left as it was, and why.
+    """
+
+    labels: LabelMap
+    changed: float
+    moved_mm: Mapping[str, tuple[float, float]]
+    notes: tuple[str, ...] = ()
+
+
+@checked
+def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None] = lambda _: None) -> CorrectedLabels:
+    """Move the borders of bones and skin to where the image shows them, by up to 2.5 voxels.
+
+    A bone ends where its dark rim becomes as bright as the tissue beside it; skin ends where the brightness below the
+    surface rises. Where the image shows no such edge, the border stays. What becomes bone or soft tissue gets the
+    nearest label of that kind.
+
+    Parameters
+    ----------
+    image : Image
+        Unloaded image, in which fat is brighter than skin and cortical bone.
+    labels : LabelMap
+        Tissues on the image's grid. Bones are the labels that are named like one, and skin is the one named "skin".
+    watch : callable, optional
+        Told how far it is, from 0 to 1.
+
+    Raises
+    ------
+    InputError
+        If the labels are on another grid, or none is a bone or skin.
+    """
+    grid, given, spacing = image.grid, labels.labels, image.grid.spacing_mm
+    if not labels.grid.same_as(grid):
+        raise InputError("The labels are on another grid than the image; resample them with `fit_mask`.")
+    names = labels.names.items()
+    bones = np.isin(given, [number for number, name in names if is_bones_name(name)])
+    skin = np.isin(given, [number for number, name in names if name.casefold() == "skin"])
+    if not (bones.any() or skin.any()):
+        raise InputError("No label is named skin, or like a bone, so there is no border to correct. Check the names.")
+    watch(0.1)
+    even, body, reach = fill_missing(without_bias_field(image)), given > 0, _REACH * float(spacing.mean())
+    watch(0.2)
+    notes = list[str]()
+    new_skin = skin
+    if skin.any():
+        near_bone = distance_transform_edt(~bones, sampling=spacing) <= reach if bones.any() else bones
+        found = Skin.of(even, Mask(grid, body), near_bone)
+        if found is None:
+            notes.append("The border of skin stays: the image shows no darker layer at the surface of the body.")
+        else:
+            at_border = np.abs(depth_mm(body & ~skin, spacing)) <= reach
+            new_skin = np.where(at_border & ~bones, found.probability > 0.5, skin) & body
+    watch(0.6)
+    new_bones = bones
+    if bones.any():
+        tissues = [given == number for number in np.unique(given[body & ~bones])]
+        new_bones = _bones(even.values, bones, body & ~new_skin, tissues, spacing, reach) & body
+    new_skin &= ~new_bones
+    watch(0.9)
+    others = body & ~bones & ~skin
+    corrected = np.where(new_bones, _nearest(given, bones), np.where(new_skin, _nearest(given, skin), 0))
+    corrected = np.where(body & ~new_bones & ~new_skin, _nearest(given, others), corrected)
+    moved = {
+        name: _moved(before, after, spacing)
+        for name, before, after in (("bone", bones, new_bones), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
+        if (before & body).any()
+    }
+    watch(1.0)
+    changed = float(np.mean(corrected[body] != given[body]))
+    return CorrectedLabels(LabelMap(grid, corrected, labels.names), changed, moved, tuple(notes))
+
+
+def _bones(
+    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray,
+    reach_mm: float,
+) -> BoolArray:  # fmt: skip
+    """Bones (ni, nj, nk) whose borders lie within reach of those given, at the outer edge of their dark rims.
+
+    From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim. The
+    bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Borders stay beside tissues as dark
+    as a rim, such as tendon.
+    """
+    inside, outside = (distance_transform_edt(of, sampling=spacing_mm) for of in (given, ~given))
+    parts, count = label(given)
+    deepest = np.concatenate([[0.0], np.atleast_1d(maximum(inside, parts, np.arange(1, count + 1)))])
+    core = given & (inside > np.minimum(reach_mm, 0.5 * deepest)[parts])
+    blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
+    seeds = np.where(core, 1, np.where((outside > reach_mm) | ~(soft | given), 2, 0))
+    inner = watershed(-blurred, seeds) == 1
+    near = (inside <= reach_mm) & (outside <= reach_mm) & (soft | given)
+    beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
+    dark = float(np.percentile(blurred[near], _DARK_PERCENT))
+    rim = near & (blurred < dark + _EDGE * (beside - dark))
+    thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
+    rim &= distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm
+    found = (inner | rim) & (soft | given)
+    joined, _ = label(found)
+    found = np.isin(joined, np.unique(joined[core])) & found
+    found |= binary_fill_holes(found)
+    seen = near & (beside > _LEAST_STEP * dark)
+    for tissue in tissues:
+        if float(np.median(blurred[tissue])) < _LEAST_STEP * dark:
+            seen &= distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_mm
+    return np.where(seen, found, given)
+
+
+def _mean_around(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -> FloatArray:
+    """Mean of the values (ni, nj, nk) of some voxels in the neighbourhood of each voxel; 0 if there are none."""
+    sigma = _AROUND_MM / spacing_mm
+    share = gaussian_filter(where.astype(np.float32), sigma)
+    return np.asarray(gaussian_filter(np.where(where, values, 0.0), sigma) / np.maximum(share, 1e-4))
+
+
+def _nearest(labels: IntArray, where: BoolArray) -> IntArray:
+    """The label of the nearest of some voxels, at every voxel; as given if there are none."""
+    if not where.any():
+        return labels
+    return np.asarray(labels[tuple(distance_transform_edt(~where, return_distances=False, return_indices=True))])
+
+
+def _moved(before: BoolArray, after: BoolArray, spacing_mm: FloatArray) -> tuple[float, float]:
+    """Mean and root mean square of how far a border moved outward, mm."""
+    was = depth_mm(before, spacing_mm)
+    off = (depth_mm(after, spacing_mm) - was)[np.abs(was) < 0.5 * float(spacing_mm.mean())]
+    return (float(off.mean()), float(np.sqrt((off**2).mean()))) if off.size else (0.0, 0.0)
