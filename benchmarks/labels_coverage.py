@@ -64,7 +64,8 @@ def figures(runs: Sequence[ErrorSamples]) -> dict[str, object]:
     model = error_model_of(ENGINE)
     assert model is not None
     coverage = coverage_rows(runs, model)
-    errors = [row for row in error_rows(runs) if row.by in ("all", "distance to bone, mm")]
+    near = ("fat", "distance to bone, mm")
+    errors = [row for row in error_rows(runs) if row.by == "all" or (row.tissue, row.by) == near]
     return {"coverage": [asdict(row) for row in coverage], "errors": [asdict(row) for row in errors]}
 
 

@@ -20,7 +20,7 @@ from .io.images.read import read_image
 from .io.images.write import write_image, write_labels, write_mask, write_vectors
 from .io.meshes.read import MeshFile, read_mesh
 from .io.transforms.read import read_displacement, read_transform
-from .labelling.borders import correct_labels
+from .labelling.boundaries import correct_labels
 from .labelling.tissues import TissueLabels, label_tissues
 from .measurement.judgement import Evidence
 from .measurement.measure import measure

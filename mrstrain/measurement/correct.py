@@ -1,4 +1,4 @@
-"""A label map that was drawn, with the borders of its bones and skin where the image shows them; a part of `label`."""
+"""A drawn label map, with the boundaries of its bones and skin where the image shows them; a part of `label`."""
 
 import time
 from collections.abc import Callable
@@ -32,9 +32,9 @@ def corrected(
     told = f"{100 * made.changed:.1f} % of the voxels have another label"
     borders = tuple((name, mean, rms) for name, (mean, rms) in made.moved_mm.items())
     listed = "; ".join(f"{name} {mean:+.2f} (rms {rms:.2f})" for name, mean, rms in borders)
-    outward = "Borders moved outward by, mm (skin: became thicker by)"
+    outward = "Boundaries moved outward by, mm (skin: became thicker by)"
     lines = (f"{told}; {files.picture} shows them.", f"{outward}: {listed}", *made.notes)
-    table = Table("How far borders moved", ("border of", "mean, mm", "rms, mm"), borders, f"{outward}.")
+    table = Table("How far boundaries moved", ("boundary of", "mean, mm", "rms, mm"), borders, f"{outward}.")
     section = Section(
         "Corrected label map", None, (table,), (picture,), (f"{told}.", *made.notes), pictures_first=True
     )  # fmt: skip

@@ -27,7 +27,7 @@ def label(
     load0: Path | str, *, out: Path | str, masks: BoneAndBody, strokes: Marks, drawn: DrawnLabels,
     watch: Callable[[float], None] | None = None,
 ) -> Labelled:  # fmt: skip
-    """Label skin, fat, muscle and other bones of an unloaded image, or correct the borders of a label map.
+    """Label skin, fat, muscle and other bones of an unloaded image, or correct the boundaries of a label map.
 
     Parameters
     ----------

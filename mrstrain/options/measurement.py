@@ -44,7 +44,7 @@ class DrawnLabels(Options):
     panel: ClassVar[str] = "Inputs"
 
     labels: Path | None = None
-    """Label map to correct, instead of --bone and --marks: the borders of its bones and skin move to where the image
+    """Label map to correct, instead of --bone and --marks: the boundaries of its bones and skin move to where the image
     shows them, by up to 2.5 voxels."""
     names: Path | None = None
     """Table of its label names: ITK-SNAP, Slicer or CSV."""

@@ -13,6 +13,7 @@ from dvc.threads import usable_cores
 from fe import LoadStep, material_set, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
+from mrstrain.records.progress import duration
 from mrstrain.studies.file import Study
 from mrstrain.studies.plan import Stage, labels_to_mesh, mesh_place
 from mrstrain.studies.time_left import Expected, TimeLeft
@@ -138,13 +139,13 @@ def costs(
 
     ``workers`` is the number of stages at the same time; the other parameters are as in `seconds_of`.
     """
-    minutes = TimeLeft(expected(left, study, voxels, cells), workers).seconds() / 60.0
+    time = duration(TimeLeft(expected(left, study, voxels, cells), workers).seconds())
     gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
     needed = sum(gib[:workers])  # the largest stages may run at the same time
     disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9
     free = shutil.disk_usage(study.place).free / 1e9
     lines = [
-        f"To do: {len(left)} of {len(stages)} stages, about {minutes:.0f} minutes on {workers} cores, "
+        f"To do: {len(left)} of {len(stages)} stages, about {time} on {workers} cores, "
         f"{needed:.1f} GiB of memory, {disk:.1f} GB of disk space ({free:.0f} GB free)."
     ]
     if disk > free:

@@ -1,4 +1,4 @@
-"""Borders of bones and skin in a label map that was drawn, moved to where the image shows them."""
+"""Boundaries of bones and skin in a label map that was drawn, moved to where the image shows them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,17 +29,17 @@ _LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the im
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedLabels:
-    """A label map with corrected borders.
+    """A label map with corrected boundaries.
 
     Attributes
     ----------
     labels : LabelMap
-        On the image's grid; the outline of the body, and borders between soft tissues, are as given.
+        On the image's grid; the outline of the body, and boundaries between soft tissues, are as given.
     changed : float
         Share of the labelled voxels that have another label.
     moved_mm : mapping
-        Mean and root mean square of how far the borders of "bone" and "skin" moved, mm, by name: above zero where the
-        bone grew, or the skin became thicker.
+        Mean and root mean square of how far the boundaries of "bone" and "skin" moved, mm, by name: above zero where
+        the bone grew, or the skin became thicker.
     notes : tuple of str
         What was left as it was, and why.
     """
@@ -52,10 +52,10 @@ class CorrectedLabels:
 
 @checked
 def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None] = lambda _: None) -> CorrectedLabels:
-    """Move the borders of bones and skin to where the image shows them, by up to 2.5 voxels.
+    """Move the boundaries of bones and skin to where the image shows them, by up to 2.5 voxels.
 
     A bone ends where its dark rim becomes as bright as the tissue beside it; skin ends where the brightness below the
-    surface rises. Where the image shows no such edge, the border stays. What becomes bone or soft tissue gets the
+    surface rises. Where the image shows no such edge, the boundary stays. What becomes bone or soft tissue gets the
     nearest label of that kind.
 
     Parameters
@@ -79,7 +79,7 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
     bones = np.isin(given, [number for number, name in names if is_bones_name(name)])
     skin = np.isin(given, [number for number, name in names if name.casefold() == "skin"])
     if not (bones.any() or skin.any()):
-        raise InputError("No label is named skin, or like a bone, so there is no border to correct. Check the names.")
+        raise InputError("No label is named skin, or like a bone, so there is no boundary to correct. Check the names.")
     watch(0.1)
     even, body, reach = fill_missing(without_bias_field(image)), given > 0, _REACH * float(spacing.mean())
     watch(0.2)
@@ -89,7 +89,7 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
         near_bone = distance_transform_edt(~bones, sampling=spacing) <= reach if bones.any() else bones
         found = Skin.of(even, Mask(grid, body), near_bone)
         if found is None:
-            notes.append("The border of skin stays: the image shows no darker layer at the surface of the body.")
+            notes.append("The boundary of skin stays: the image shows no darker layer at the surface of the body.")
         else:
             at_border = np.abs(depth_mm(body & ~skin, spacing)) <= reach
             new_skin = np.where(at_border & ~bones, found.probability > 0.5, skin) & body
@@ -117,11 +117,11 @@ def _bones(
     values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray,
     reach_mm: float,
 ) -> BoolArray:  # fmt: skip
-    """Bones (ni, nj, nk) whose borders lie within reach of those given, at the outer edge of their dark rims.
+    """Bones (ni, nj, nk) whose boundaries lie within reach of those given, at the outer edge of their dark rims.
 
     From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim. The
-    bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Borders stay beside tissues as dark
-    as a rim, such as tendon.
+    bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Boundaries stay beside tissues as
+    dark as a rim, such as tendon.
     """
     inside, outside = (distance_transform_edt(of, sampling=spacing_mm) for of in (given, ~given))
     parts, count = label(given)
@@ -162,7 +162,7 @@ def _nearest(labels: IntArray, where: BoolArray) -> IntArray:
 
 
 def _moved(before: BoolArray, after: BoolArray, spacing_mm: FloatArray) -> tuple[float, float]:
-    """Mean and root mean square of how far a border moved outward, mm."""
+    """Mean and root mean square of how far a boundary moved outward, mm."""
     was = depth_mm(before, spacing_mm)
     off = (depth_mm(after, spacing_mm) - was)[np.abs(was) < 0.5 * float(spacing_mm.mean())]
     return (float(off.mean()), float(np.sqrt((off**2).mean()))) if off.size else (0.0, 0.0)

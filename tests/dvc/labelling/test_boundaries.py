@@ -80,7 +80,7 @@ def test_skin_that_the_image_does_not_show_stays_and_is_told(heel: tuple[Image, 
     even = np.where(truth.labels > 0, 500.0, 0.0) + np.random.default_rng(1).normal(0.0, 10.0, truth.labels.shape)
     made = correct_labels(Image(truth.grid, even.astype(np.float32)), truth)
     assert np.array_equal(made.labels.region("skin").inside, truth.region("skin").inside)
-    assert any("The border of skin stays" in note for note in made.notes)
+    assert any("The boundary of skin stays" in note for note in made.notes)
 
 
 def test_what_has_no_border_to_correct_is_refused(heel: tuple[Image, LabelMap]) -> None:
