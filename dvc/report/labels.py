@@ -14,6 +14,13 @@ from dvc.report.style import SMALL, TISSUES, looks
 _CHANGED = "#d62728"
 
 
+def tissue_slices(view: View, image: Image, labels: LabelMap) -> Figure:
+    """Tissues in colour over the unloaded image."""
+    sheet = Sheet(view, ["Tissues"])
+    _tissues(sheet, view, image, labels)
+    return sheet.finished()
+
+
 def label_slices(view: View, image: Image, labels: LabelMap, probability: Float32Array) -> Figure:
     """Tissues in colour over the unloaded image, and the probability of the label of each voxel.
 

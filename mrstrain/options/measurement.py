@@ -1,5 +1,6 @@
 """Options of measuring: the subject, the registration, and where results are wanted."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -12,8 +13,19 @@ AUTO = Path("auto")
 """In place of a label map: it is made from the image."""
 MADE_LABELS = "labels/tissues.nii.gz"
 """The label map that is made, in the folder of the results."""
+IMAGE, LABELS = "{image}", "{labels}"
+"""Places of the unloaded image and of the label map in a command that segments."""
 Frame = Literal["LPS", "RAS"]
 Unit = Literal["mm", "m"]
+
+
+def command_parts(command: str) -> list[str]:
+    """The words of a command that segments; ValueError if a quotation is not closed, or a file has no place in it."""
+    parts = shlex.split(command)
+    for place, what in ((IMAGE, "the unloaded image"), (LABELS, "the label map")):
+        if not any(place in part for part in parts):
+            raise ValueError(f"the command needs {place} where it takes {what}, such as: segment {IMAGE} {LABELS}")
+    return parts
 
 
 class BoneAndBody(Options):

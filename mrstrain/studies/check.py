@@ -148,7 +148,8 @@ class _Look:
     def labels(self, reference: Image | None) -> LabelMap | None:
         """The labels, on the unloaded image's grid; None if they are to be made from the image."""
         if self.study.makes_labels:
-            self.notes.append("Labels: made from the image")
+            command = self.study.images.labels_command
+            self.notes.append(f"Labels: made by the command {command}" if command else "Labels: made from the image")
             self.at_marks(reference)
             return None
         labels = self.tried(read_labels, *self.study.labels)
@@ -273,7 +274,8 @@ class _Look:
             self.wrong.append(
                 f"[models] fixed: only 'cut' can be fixed in addition to the bone; got {', '.join(sorted(unknown))}."
             )
-        if labels is None and not (self.study.makes_labels and self.study.mesh.labels is None):
+        known = self.study.makes_labels and self.study.mesh.labels is None and not self.study.images.labels_command
+        if labels is None and not known:
             return
         if labels is not None and reference is not None and self.study.mesh.labels is not None:
             there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())

@@ -14,7 +14,7 @@ from dvc.errors import InputError
 from dvc.file_names import as_file_name, clash, one_spelling
 from dvc.io.result_folder import REPEAT
 from mrstrain.options import modelling
-from mrstrain.options.measurement import AUTO, Frame, RegistrationOptions, SubjectFiles, Unit
+from mrstrain.options.measurement import AUTO, Frame, RegistrationOptions, SubjectFiles, Unit, command_parts
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
 from mrstrain.records.inputs import made_labels
 
@@ -53,6 +53,8 @@ class Images(SubjectFiles):
     """With labels = "auto": label map of a few strokes in each tissue."""
     mark_names: Path | None = None
     """Table of the names of the marks."""
+    labels_command: str | None = None
+    """With labels = "auto": a segmenter, run instead; it takes {image} and writes {labels}."""
     bone_label: str | None = Field(default=None, validation_alias="bone")
     """Name of the bone's label, for the rigid alignment; by default "bone"."""
     bone: Path | None = Field(default=None, validation_alias="bone_mask")
@@ -65,8 +67,12 @@ class Images(SubjectFiles):
     @model_validator(mode="after")
     def _of_auto(self) -> Self:
         if self.labels != AUTO:
+            if self.marks or self.mark_names or self.labels_command:
+                raise ValueError("'marks', 'mark_names' and 'labels_command' are only for labels = \"auto\"")
+        elif self.labels_command is not None:
             if self.marks or self.mark_names:
-                raise ValueError("'marks' and 'mark_names' are only for labels = \"auto\"")
+                raise ValueError("'labels_command' makes the label map, so give it without 'marks' and 'mark_names'")
+            command_parts(self.labels_command)
         elif self.bone is None and self.marks is None:
             raise ValueError("labels = \"auto\" needs 'bone_mask', the mask of the bone, or 'marks' with that bone")
         elif self.names is not None:

@@ -121,6 +121,8 @@ def _labelling(study: Study) -> list[Stage]:
     images = study.images.located(study.place)
     masks = {name: getattr(images, name) for name in ("bone", "tissue", "marks", "mark_names")}
     labels, files = study.labels[0], [images.load0, *masks.values()]
+    if images.labels_command is not None:
+        masks, files = {"command": images.labels_command, "names": images.names}, [images.load0, images.names]
     return [Stage("label", {"load0": images.load0, **masks, "out": labels}, study.given(files), (labels.parent,))]
 
 

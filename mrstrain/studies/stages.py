@@ -37,10 +37,12 @@ class StageResult:
 
 
 def label(tell: Tell, *, load0: Path, out: Path, **options: Any) -> StageResult:
-    """Make the label map from the unloaded image; as `mrstrain.label`."""
+    """Make the label map from the unloaded image; as `mrstrain.label`, or by a command."""
     from mrstrain.measurement.label import label as run
+    from mrstrain.measurement.label_command import labelled_by_command
 
-    done = run(load0, out=out, watch=lambda share: tell("tissues", share), **options)
+    make = labelled_by_command if "command" in options else run
+    done = make(load0, out=out, watch=lambda share: tell("tissues", share), **options)
     return StageResult(tuple(done.summary()[:-1]), (done.section,), headline=done.headline)
 
 
