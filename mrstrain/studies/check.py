@@ -23,7 +23,7 @@ from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
-from mrstrain.studies.plan import Stage, labels_to_mesh, load_steps, mesh_place, plan
+from mrstrain.studies.plan import Stage, drawn_to_mesh, load_steps, mesh_place, plan
 from validate import check_bones, check_overlap, read_thresholds
 
 _T = TypeVar("_T")
@@ -126,8 +126,8 @@ class _Look:
         if asked("register", "level"):
             self.at_registration(labels)
         if study.models.sets and asked("mesh", "simulate", "drive"):
-            made_later = study.mesh.file or (study.makes_labels and study.mesh.labels is None)
-            to_mesh = None if made_later else self.tried(read_labels, *labels_to_mesh(study))
+            drawn = None if study.mesh.file else drawn_to_mesh(study)
+            to_mesh = None if drawn is None else self.tried(read_labels, *drawn)
             if asked("mesh") and to_mesh is not None:
                 self.at_meshing(to_mesh)
             if asked("simulate", "drive"):
@@ -147,12 +147,12 @@ class _Look:
 
     def labels(self, reference: Image | None) -> LabelMap | None:
         """The labels, on the unloaded image's grid; None if they are to be made from the image."""
-        if self.study.makes_labels:
+        if self.study.drawn_labels is None:
             command = self.study.images.labels_command
             self.notes.append(f"Labels: made by the command {command}" if command else "Labels: made from the image")
             self.at_marks(reference)
             return None
-        labels = self.tried(read_labels, *self.study.labels)
+        labels = self.tried(read_labels, *self.study.drawn_labels)
         if labels is not None:
             self.notes.append(f"Labels: {', '.join(labels.names.values())}")
             if reference is not None:
@@ -274,7 +274,7 @@ class _Look:
             self.wrong.append(
                 f"[models] fixed: only 'cut' can be fixed in addition to the bone; got {', '.join(sorted(unknown))}."
             )
-        known = self.study.makes_labels and self.study.mesh.labels is None and not self.study.images.labels_command
+        known = drawn_to_mesh(self.study) is None and not self.study.images.labels_command
         if labels is None and not known:
             return
         if labels is not None and reference is not None and self.study.mesh.labels is not None:

@@ -15,7 +15,7 @@ from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.records.progress import duration
 from mrstrain.studies.file import Study
-from mrstrain.studies.plan import Stage, labels_to_mesh, mesh_place
+from mrstrain.studies.plan import Stage, drawn_to_mesh, mesh_place
 from mrstrain.studies.time_left import Expected, TimeLeft
 
 CARE = "WARNING"
@@ -54,13 +54,15 @@ def sizes_of(study: Study) -> tuple[float, float]:
     try:
         reference, how = read_image(study.path(study.images.load0), allow_missing=True), study.mesh
         voxels = float(np.prod(reference.grid.shape))
-        if study.makes_labels and how.file is None and how.labels is None:
+        drawn = drawn_to_mesh(study)
+        if how.file is None and drawn is None:
             return voxels, _LEAST_CELLS
         if not study.models.sets:
             return voxels, 0.0
         if how.file is not None:
             return voxels, float(len(mesh_given(study).cells))
-        labels = read_labels(*labels_to_mesh(study))
+        assert drawn is not None
+        labels = read_labels(*drawn)
     except (InputError, OSError):
         return _USUAL_VOXELS, _LEAST_CELLS
     bones = bones_of(labels, how.bones)

@@ -53,6 +53,8 @@ class Images(SubjectFiles):
     """With labels = "auto": label map of a few strokes in each tissue."""
     mark_names: Path | None = None
     """Table of the names of the marks."""
+    correct_labels: Flag = False
+    """Whether the boundaries of bones and skin in the label map move to where the image shows them."""
     labels_command: str | None = None
     """With labels = "auto": a segmenter, run instead; it takes {image} and writes {labels}."""
     bone_label: str | None = Field(default=None, validation_alias="bone")
@@ -69,6 +71,8 @@ class Images(SubjectFiles):
         if self.labels != AUTO:
             if self.marks or self.mark_names or self.labels_command:
                 raise ValueError("'marks', 'mark_names' and 'labels_command' are only for labels = \"auto\"")
+        elif self.correct_labels:
+            raise ValueError("'correct_labels' is for a label map that was drawn, not for labels = \"auto\"")
         elif self.labels_command is not None:
             if self.marks or self.mark_names:
                 raise ValueError("'labels_command' makes the label map, so give it without 'marks' and 'mark_names'")
@@ -190,15 +194,21 @@ class Study(_Part):
 
     @property
     def makes_labels(self) -> bool:
-        """Whether the label map is made from the image."""
-        return self.images.labels == AUTO
+        """Whether the label map is made or corrected by the image, in the stage "label"."""
+        return self.drawn_labels is None or self.images.correct_labels
+
+    @property
+    def drawn_labels(self) -> tuple[Path, Path | None] | None:
+        """The label map of the unloaded image as it is given, and the table of its names; None if it is to be made."""
+        if self.images.labels == AUTO:
+            return None
+        return self.path(self.images.labels), self.optional_path(self.images.names)
 
     @property
     def labels(self) -> tuple[Path, Path | None]:
-        """The label map of the unloaded image, given or made by the stage "label", and the table of its names."""
-        if self.makes_labels:
-            return made_labels(self.out)
-        return self.path(self.images.labels), self.optional_path(self.images.names)
+        """The label map of the unloaded image that all stages use, and the table of its names."""
+        drawn = self.drawn_labels
+        return made_labels(self.out) if drawn is None or self.images.correct_labels else drawn
 
     @property
     def subject_files(self) -> SubjectFiles:

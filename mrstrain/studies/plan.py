@@ -121,7 +121,10 @@ def _labelling(study: Study) -> list[Stage]:
     images = study.images.located(study.place)
     masks = {name: getattr(images, name) for name in ("bone", "tissue", "marks", "mark_names")}
     labels, files = study.labels[0], [images.load0, *masks.values()]
-    if images.labels_command is not None:
+    if study.drawn_labels is not None:
+        masks = dict(zip(("labels", "names"), study.drawn_labels, strict=True))
+        files = [images.load0, *study.drawn_labels]
+    elif images.labels_command is not None:
         masks, files = {"command": images.labels_command, "names": images.names}, [images.load0, images.names]
     return [Stage("label", {"load0": images.load0, **masks, "out": labels}, study.given(files), (labels.parent,))]
 
@@ -164,6 +167,11 @@ def _registrations(study: Study) -> list[Stage]:
 def mesh_place(study: Study) -> Path:
     """The mesh for the simulations: made by the stage "mesh", or a given file."""
     return study.out / MESH if study.mesh.file is None else study.path(study.mesh.file)
+
+
+def drawn_to_mesh(study: Study) -> tuple[Path, Path | None] | None:
+    """The label map that is meshed, before it is corrected, with its names; None if it is to be made."""
+    return study.drawn_labels if study.mesh.labels is None else labels_to_mesh(study)
 
 
 def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:

@@ -143,6 +143,19 @@ def test_labels_from_the_image_come_before_all_that_reads_them(tmp_path):
     assert {stage.name: stage for stage in plan(other)}["mesh"].after == ()
 
 
+def test_a_label_map_that_was_drawn_is_corrected_first(tmp_path):
+    text = WHOLE.replace('"tissues.nii.gz"', '"tissues.nii.gz"\ncorrect_labels = true\nnames = "tissues.csv"')
+    stages = {stage.name: stage for stage in plan(read_study(written(tmp_path, text)))}
+    given = {"labels": tmp_path / "tissues.nii.gz", "names": tmp_path / "tissues.csv"}
+    assert given.items() <= stages["label"].arguments.items()
+    assert [path.name for path in stages["label"].files] == ["Load0.nii.gz", "tissues.nii.gz", "tissues.csv"]
+    for name in ("register Load1", "mesh", "compare"):
+        assert stages[name].arguments["labels"] == tmp_path / "results" / "labels" / "tissues.nii.gz", name
+        assert "label" in stages[name].after, name
+    with pytest.raises(InputError, match="for a label map that was drawn"):
+        read_study(written(tmp_path, text.replace('"tissues.nii.gz"', '"auto"')))
+
+
 def test_chained_loads_wait_for_one_another(tmp_path):
     stages = plan(read_study(written(tmp_path, WHOLE + "[registration]\nchain = true\n")))
     assert next(s for s in stages if s.name == "register Load2").before == ("register Load1",)
