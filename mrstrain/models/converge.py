@@ -91,6 +91,7 @@ def converge(
     tell, region, material = progress or (lambda *_: None), followed.region, followed.material
     tissues = read_labels(labels, labelling.names)
     known, bones = list(tissues.names.values()), bones_of(tissues, labelling.bones)
+    labelling = labelling.model_copy(update={"bones": bones})
     if region not in known or region in bones:
         raise InputError(f"The label map has no soft tissue '{region}'; it has {', '.join(known)}.")
     # an unsuitable material set is refused before hours of meshing
