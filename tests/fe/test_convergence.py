@@ -97,7 +97,7 @@ def test_the_command(tmp_path: Path) -> None:
     onion = half_onion()
     plain = LabelMap(onion.grid, np.where(onion.labels == 3, 2, onion.labels), {1: "bone", 2: "fat"})  # nothing thin
     write_labels(tmp_path / "map.nii.gz", plain)
-    sizes = [text for edge in ("5.0", "3.2", "2.2") for text in ("--edge-mm", edge)]
+    sizes = [text for edge in ("5.0", "2.6", "1.6") for text in ("--edge-mm", edge)]
     given = [*sizes, "--names", str(tmp_path / "map.csv"), "--load", "pressed=3", "--set", "luboz"]
     out = tmp_path / "study"
     done = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
@@ -106,13 +106,13 @@ def test_the_command(tmp_path: Path) -> None:
     with (out / "convergence.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximum shear strain of fat, p50"]
-    assert 0.1 < float(rows[0]["edge_2.2_mm"]) < 10.0
+    assert 0.1 < float(rows[0]["edge_1.6_mm"]) < 10.0
     for ending in ("png", "pdf"):
         assert any(row["limit"] for row in rows) == (out / f"convergence.{ending}").is_file()
-    before = (out / "mesh-3.2.vtu").read_bytes()
+    before = (out / "mesh-2.6.vtu").read_bytes()
     again = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
     assert again.exit_code == 0
-    assert (out / "mesh-3.2.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
+    assert (out / "mesh-2.6.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
     assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
 
 
