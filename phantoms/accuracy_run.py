@@ -174,7 +174,7 @@ def measure_run(
         ``progress(fraction)`` of the registration.
     label : callable, optional
         Makes the label map that the registration is given, numbered as `TISSUES`, from the unloaded image and the mask
-        of its bone. By default, it is the phantom's own.
+        of its bone; its "bone" is the one that is aligned. By default, it is the phantom's own.
 
     Raises
     ------
@@ -183,9 +183,9 @@ def measure_run(
     """
     with computing:
         reference, loaded, labels, motion = _phantom_pair(case)
-        bone, body = labels.region("bone"), labels.labels > 0
+        body = labels.labels > 0
         if label is not None:
-            labels = label(reference, bone)
+            labels = label(reference, labels.region("bone"))
     # A wave moves the bone too, so there is nothing to align on.
     align_on = "bone" if case.wavelength_mm is None else "none"
     settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
@@ -194,7 +194,7 @@ def measure_run(
     elif case.keeps_volume:
         settings = replace(settings, engine=settings.engine.keeping_volume())
     registration = register(
-        reference, loaded, bone=bone, tissue=Mask(labels.grid, labels.labels > 0), labels=labels,
+        reference, loaded, bone=labels.region("bone"), tissue=Mask(labels.grid, labels.labels > 0), labels=labels,
         settings=settings, worker=worker,
         progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),
     )  # fmt: skip
