@@ -1,6 +1,7 @@
 """Boundaries of bones and skin in a label map that was drawn, moved to where the image shows them."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from dvc.images.bias_field import without_bias_field
 from dvc.images.depth import depth_mm
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
+from dvc.images.tissue import tissue_mask, within
 from dvc.labelling.skin import Skin
 from dvc.measurement.subject import is_bones_name
 
@@ -52,7 +54,7 @@ class CorrectedLabels:
 
 @checked
 def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None] = lambda _: None) -> CorrectedLabels:
-    """Move the boundaries of bones and skin to where the image shows them, by up to 2.5 voxels.
+    """Move the boundaries of bones and skin to where the image shows them, by up to 2.5 times the mean voxel edge.
 
     A bone ends where its dark rim becomes as bright as the tissue beside it; skin ends where the brightness below the
     surface rises. Where the image shows no such edge, the boundary stays. What becomes bone or soft tissue gets the
@@ -83,21 +85,25 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
     watch(0.1)
     even, body, reach = fill_missing(without_bias_field(image)), given > 0, _REACH * float(spacing.mean())
     watch(0.2)
-    notes = list[str]()
+    notes, ends = list[str](), _without_labels(image, body, spacing, reach)
+    whole, fixed = body | ends, within(ends, spacing, reach)
+    if ends.any():
+        notes.append("Boundaries stay where the labels end in tissue that has none.")
     new_skin = skin
     if skin.any():
         near_bone = distance_transform_edt(~bones, sampling=spacing) <= reach if bones.any() else bones
-        found = Skin.of(even, Mask(grid, body), near_bone)
+        found = Skin.of(even, Mask(grid, whole), near_bone | ends)
         if found is None:
             notes.append("The boundary of skin stays: the image shows no darker layer at the surface of the body.")
         else:
-            at_border = np.abs(depth_mm(body & ~skin, spacing)) <= reach
+            at_border = (np.abs(depth_mm(whole & ~skin, spacing)) <= reach) & ~fixed
             new_skin = np.where(at_border & ~bones, found.probability > 0.5, skin) & body
     watch(0.6)
     new_bones = bones
     if bones.any():
         tissues = [given == number for number in np.unique(given[body & ~bones])]
-        new_bones = _bones(even.values, bones, body & ~new_skin, tissues, spacing, reach) & body
+        found_bones = _bones(even.values, bones, whole & ~new_skin, tissues, spacing, reach)
+        new_bones = np.where(fixed, bones, found_bones) & body
     new_skin &= ~new_bones
     watch(0.9)
     others = body & ~bones & ~skin
@@ -111,6 +117,17 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
     watch(1.0)
     changed = float(np.mean(corrected[body] != given[body]))
     return CorrectedLabels(LabelMap(grid, corrected, labels.names), changed, moved, tuple(notes))
+
+
+def _without_labels(image: Image, body: BoolArray, spacing_mm: FloatArray, reach_mm: float) -> BoolArray:
+    """Tissue beyond the labels (ni, nj, nk): where it is thicker than a body that was drawn a voxel too small."""
+    unlabelled = ~body
+    with suppress(InputError):  # the image shows no air
+        unlabelled &= tissue_mask(image).inside
+    if not unlabelled.any():
+        return unlabelled
+    deep = distance_transform_edt(unlabelled, sampling=spacing_mm) > reach_mm
+    return within(deep, spacing_mm, 1.5 * reach_mm) & unlabelled
 
 
 def _bones(

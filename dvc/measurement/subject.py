@@ -17,8 +17,13 @@ from dvc.io.meshes.read import MeshFile
 _BONES = {
     "bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform", "metatarsal",
     "femur", "trochanter", "patella", "pelvis", "sacrum", "coccyx", "ilium", "ischium", "pubis", "vertebra",
+    "vertebrae", "hip", "rib", "sternum", "scapula", "clavicle", "humerus", "radius", "ulna", "tarsal", "phalanx",
+    "phalanges", "sesamoid",
 }  # fmt: skip
-_SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
+_SOFT = {
+    "fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage", "bursa",
+    "nerve", "vessel", "artery", "vein", "capsule", "retinaculum", "meniscus", "disc", "marrow",
+}  # fmt: skip
 _HEEL = ("bone", "calcaneus")
 _INFERIOR = (0.0, 0.0, -1.0)
 _MOST_UNSURE = 0.2  # of the voxels; .11 to .16 on the phantoms for which error bars were found to hold
@@ -148,8 +153,9 @@ def bones_of(labels: LabelMap, given: Sequence[str] = ()) -> tuple[str, ...]:
 def is_bones_name(name: str) -> bool:
     """Whether a label is named like a bone.
 
-    >>> [is_bones_name(name) for name in ("Talus", "tibia_left", "Sacrum", "fat pad", "calcaneus tendon")]
+    >>> [is_bones_name(name) for name in ("Talus", "tibia_left", "metatarsals", "fat pad", "ankle ligaments")]
     [True, True, True, False, False]
     """
     words = set(re.split(r"[^a-z]+", name.lower()))
+    words |= {word.removesuffix("s") for word in words}
     return bool(words & _BONES) and not words & _SOFT

@@ -25,6 +25,7 @@ def corrected(
     moved = {name: {"mean_mm": mean, "rms_mm": rms} for name, (mean, rms) in made.moved_mm.items()}
     found = {"changed": made.changed, "moved": moved, "notes": list(made.notes)}
     with files.alone():
+        files.remove_probability()  # of an earlier label map
         write_labels(files.labels, made.labels)
         shown = view_of(made.labels), image, given, made.labels
         picture = Drawing.of("Corrected label map", changed_slices, *shown).save(files.stem)

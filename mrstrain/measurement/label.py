@@ -34,8 +34,8 @@ def label(
     load0 : path
         Unloaded image.
     out : path
-        The label map. Beside it are written the names (.csv), the probability of each tissue (STEM_probability), a
-        picture (.png, .pdf), and a record (.json).
+        The label map. Beside it are written the names (.csv), a picture (.png, .pdf), a record (.json), and, unless a
+        label map is corrected, the probability of each tissue (STEM_probability).
     masks, strokes
         The bone, or the mark of one, is required; as in `dvc.label_tissues`.
     drawn

@@ -1,6 +1,8 @@
 """A label map from a segmenter of the user's choice: a command that takes an image and writes a label map."""
 
+import os
 import subprocess
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,12 +16,16 @@ from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volu
 from mrstrain.options.measurement import IMAGE, LABELS, command_parts
 from mrstrain.records.provenance import provenance
 
+_ONE_THREAD = {"OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"}
+"""Variables by which the stages of a study keep to a core each."""
+_TOLD_EVERY_S, _HALF_S = 5.0, 120.0  # how long a command takes is not known
 _SHOWN = 3  # last lines of what a command printed
 
 
 def labelled_by_command(
-    load0: Path, command: str, names: Path | None, out: Path, watch: Callable[[float], None] = lambda _: None
-) -> Labelled:
+    load0: Path, command: str, names: Path | None, out: Path, sha256: str = "",
+    watch: Callable[[float], None] = lambda _: None,
+) -> Labelled:  # fmt: skip
     """Run a command that segments the unloaded image, and write its label map with names, picture and record.
 
     Parameters
@@ -32,6 +38,10 @@ def labelled_by_command(
         Table of the names of the command's labels.
     out : path
         The label map.
+    sha256 : str
+        Hash of the command, for a record.
+    watch : callable, optional
+        Told now and then that the command goes on, from 0 to 1.
 
     Raises
     ------
@@ -48,14 +58,16 @@ def labelled_by_command(
     with files.alone():
         made = files.beside("_of_command.nii.gz")
         try:
-            _run(command, load0, made)
+            made.unlink(missing_ok=True)
+            _run(command, load0, made, watch)
             labels = fit_mask(read_labels(made, names), image.grid, f"The label map of '{command}'")
         finally:
             made.unlink(missing_ok=True)
+        files.remove_probability()  # of an earlier label map
         write_labels(files.labels, labels)
         picture = Drawing.of("Tissues", tissue_slices, view_of(labels), image, labels).save(files.stem)
         inputs = {"load0": load0} | ({} if names is None else {"names": names})
-        write_json(files.beside(".json"), provenance("label", inputs, {"command": command}))
+        write_json(files.beside(".json"), provenance("label", inputs, {"command": command, "sha256": sha256}))
     watch(1.0)
     volumes = volumes_ml(labels)
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
@@ -67,7 +79,7 @@ def labelled_by_command(
     )  # fmt: skip
 
 
-def _run(command: str, image: Path, labels: Path) -> None:
+def _run(command: str, image: Path, labels: Path, watch: Callable[[float], None]) -> None:
     """Run the command with the two files in it."""
     try:
         parts = command_parts(command)
@@ -76,14 +88,35 @@ def _run(command: str, image: Path, labels: Path) -> None:
     place = image.resolve().parent
     given = [part.replace(IMAGE, str(image.resolve())).replace(LABELS, str(labels.resolve())) for part in parts]
     try:
-        done = subprocess.run(given, cwd=place, capture_output=True, text=True, errors="replace", check=False)
+        code, said = _watched(given, place, watch)
     except OSError as failure:
         what = f"labels_command: {parts[0]} cannot be run ({failure.strerror or failure})"
         raise MrstrainError(f"{what}. Install it, or give its whole path.") from failure
-    if done.returncode != 0:
-        raise MrstrainError(_failed(f"it ended with status {done.returncode}", command, done.stderr or done.stdout))
+    if code != 0:
+        raise MrstrainError(_failed(f"it ended with status {code}", command, said))
     if not labels.is_file():
-        raise MrstrainError(_failed(f"it wrote no file in place of {LABELS}", command, done.stderr or done.stdout))
+        raise MrstrainError(_failed(f"it wrote no file in place of {LABELS}", command, said))
+
+
+def _watched(given: Sequence[str], place: Path, watch: Callable[[float], None]) -> tuple[int, str]:
+    """Status of a command, and what it printed; it may use all cores, and ends with this block."""
+    free = {name: value for name, value in os.environ.items() if name not in _ONE_THREAD}
+    both = subprocess.PIPE, subprocess.STDOUT
+    began = time.monotonic()
+    with subprocess.Popen(
+        given, cwd=place, env=free, stdout=both[0], stderr=both[1], text=True, errors="replace"
+    ) as running:  # fmt: skip
+        try:
+            while True:
+                try:
+                    said, _ = running.communicate(timeout=_TOLD_EVERY_S)
+                    return running.returncode, said
+                except subprocess.TimeoutExpired:
+                    spent = time.monotonic() - began
+                    watch(spent / (spent + _HALF_S))
+        except BaseException:
+            running.kill()
+            raise
 
 
 def _failed(what: str, command: str, said: str) -> str:

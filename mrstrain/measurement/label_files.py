@@ -64,6 +64,11 @@ class LabelFiles:
         """Probability of each tissue."""
         return self.beside(f"_probability{self.ending}")
 
+    def remove_probability(self) -> None:
+        """Remove the probability of each tissue, which a label map that was drawn does not have."""
+        for path in (self.probability, self.beside("_probability.json")):
+            path.unlink(missing_ok=True)
+
     @property
     def picture(self) -> Path:
         """The picture to look at first."""

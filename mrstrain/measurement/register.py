@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -103,17 +103,18 @@ def register(
             "(--labels, --bone-label). If there is no bone, use align image (--align image)."
         )
     at_once, threads = running.shares(1 if registration.chain else len(cases))
-    with nullcontext(worker) if worker else Worker(threads) as first:
+    of_labels: tuple[Section, ...] = ()
+    with ExitStack() as stack:
+        first = worker or stack.enter_context(Worker(threads))
         first.start(align_images.__module__, type(chosen).__module__)
-        if subject_files.labels == AUTO:
-            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
-        else:
-            of_labels = ()
-        subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
         # Read now: what is wrong with it must not be found after an hour.
         model = None if registration.error_model is None else read_error_model(registration.error_model)
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
+        if subject_files.labels == AUTO:
+            _hold(target, stack)
+            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
+        subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         subject = replace(subject, tissue=subject.body())
         # Its rigid motion is found by aligning.
         held = {"bone": subject.bone, "image": subject.tissue, "none": None}[align]
@@ -132,10 +133,17 @@ def register(
         record = record_of(subject, files, settings, registration, more)
         plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
         run = _Run(target, plan, images, start, tell)
-        with output_folder(target), alone(target):
-            run.all(at_once, registration.chain, first)
-            finished = run.finished()
+        if not of_labels:
+            _hold(target, stack)
+        run.all(at_once, registration.chain, first)
+        finished = run.finished()
     return Series.of(target, finished, run.failures, record, of_labels)
+
+
+def _hold(out: Path, stack: ExitStack) -> None:
+    """Make the output folder, and refuse it to other runs until the stack is closed."""
+    stack.enter_context(output_folder(out))
+    stack.enter_context(alone(out))
 
 
 def _check_auto(files: SubjectFiles, cases: Sequence[str], scans: Scans) -> None:

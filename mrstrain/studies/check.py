@@ -10,6 +10,7 @@ import numpy as np
 
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
 from dvc.errors import MrstrainError
+from dvc.io.images.labels import read_names
 from dvc.io.result_folder import REPEAT
 from dvc.labelling.tissues import NAMES
 from dvc.measurement.subject import bones_of, is_bones_name
@@ -151,6 +152,11 @@ class _Look:
             command = self.study.images.labels_command
             self.notes.append(f"Labels: made by the command {command}" if command else "Labels: made from the image")
             self.at_marks(reference)
+            table = self.study.optional_path(self.study.images.names)
+            names = None if table is None else self.tried(read_names, table)
+            if names is not None and self.study.images.bone is None and self.study.bone not in names.values():
+                lacking = f"{table} has no label '{self.study.bone}'; it has {', '.join(names.values())}."
+                self.wrong.append(f"{self.study.at('images', 'bone')}: {lacking}")
             return None
         labels = self.tried(read_labels, *self.study.drawn_labels)
         if labels is not None:

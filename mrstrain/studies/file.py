@@ -68,6 +68,8 @@ class Images(SubjectFiles):
 
     @model_validator(mode="after")
     def _of_auto(self) -> Self:
+        if self.allow_missing and self.correct_labels:
+            raise ValueError("'correct_labels' needs an image without missing voxels, so not allow_missing = true")
         if self.labels != AUTO:
             if self.marks or self.mark_names or self.labels_command:
                 raise ValueError("'marks', 'mark_names' and 'labels_command' are only for labels = \"auto\"")

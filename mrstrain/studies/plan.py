@@ -1,5 +1,6 @@
 """The stages of a study: inputs, outputs and dependencies of each."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ from dvc.io.result_folder import REPEAT
 from fe import BONE, LoadStep, material_set
 from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
-from mrstrain.options.measurement import EngineOptions
+from mrstrain.options.measurement import EngineOptions, command_parts
 from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, PlateOptions, SimulationOptions
 from mrstrain.studies.file import Study
 from validate import LEVELLED
@@ -125,7 +126,12 @@ def _labelling(study: Study) -> list[Stage]:
         masks = dict(zip(("labels", "names"), study.drawn_labels, strict=True))
         files = [images.load0, *study.drawn_labels]
     elif images.labels_command is not None:
-        masks, files = {"command": images.labels_command, "names": images.names}, [images.load0, images.names]
+        command, place = images.labels_command, images.load0.parent
+        # A command may begin with a path, whose folders do not count: its hash tells one from another.
+        digest = hashlib.sha256(command.encode()).hexdigest()
+        masks = {"command": command, "sha256": digest, "names": images.names}
+        named = [file for part in command_parts(command) if (file := place / part).is_file()]
+        files = [images.load0, images.names, *named]
     return [Stage("label", {"load0": images.load0, **masks, "out": labels}, study.given(files), (labels.parent,))]
 
 

@@ -75,6 +75,19 @@ def test_a_border_that_the_image_does_not_show_stays() -> None:
     assert np.array_equal(correct_labels(image, truth).labels.labels, truth.labels)
 
 
+def test_labels_that_end_in_tissue_keep_their_boundaries_there(heel: tuple[Image, LabelMap]) -> None:
+    """Drawn in the middle third of the slices alone: the ends are no surface of the body."""
+    image, truth = heel
+    labels = truth.labels.copy()
+    low, high = labels.shape[2] // 3, 2 * labels.shape[2] // 3
+    labels[:, :, :low], labels[:, :, high:] = 0, 0
+    made = correct_labels(image, LabelMap(truth.grid, labels, truth.names))
+    for slices in (slice(low, low + 2), slice(high - 2, high)):
+        assert np.mean((made.labels.labels != labels)[:, :, slices][labels[:, :, slices] > 0]) < 0.01
+    assert np.mean((made.labels.labels != labels)[labels > 0]) < 0.03
+    assert made.notes == ("Boundaries stay where the labels end in tissue that has none.",)
+
+
 def test_skin_that_the_image_does_not_show_stays_and_is_told(heel: tuple[Image, LabelMap]) -> None:
     _, truth = heel
     even = np.where(truth.labels > 0, 500.0, 0.0) + np.random.default_rng(1).normal(0.0, 10.0, truth.labels.shape)

@@ -79,6 +79,7 @@ def test_everything_wrong_is_told_at_once_with_the_nearest_key(tmp_path):
         ('"tissues.nii.gz"', '"auto"\nmarks = "m.nii.gz"\nnames = "n.csv"', "'names' is not for labels"),
         ('"tissues.nii.gz"', '"auto"\nmarks = "m.nii.gz"\nallow_missing = true', "not allow_missing"),
         ('"tissues.nii.gz"', '"tissues.nii.gz"\nmarks = "m.nii.gz"', "only for labels"),
+        ('"tissues.nii.gz"', '"tissues.nii.gz"\ncorrect_labels = true\nallow_missing = true', "not allow_missing"),
         ("[study]", "[study", "not valid TOML"),
         ("[study]", 'place = "/tmp"\n[study]', "unknown key 'place'"),
     ],

@@ -13,7 +13,9 @@ import pytest
 from dvc import read_labels, write_image, write_labels
 from dvc.errors import InputError, MrstrainError
 from mrstrain.measurement.label_command import labelled_by_command
+from mrstrain.studies.check import check
 from mrstrain.studies.file import read_study
+from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.plan import plan
 
 SEGMENTER = """
@@ -76,12 +78,38 @@ def test_a_command_that_fails_is_told_and_leaves_nothing(folder, command, told):
     assert not (folder / "results").exists()
 
 
+def test_a_long_command_is_told_to_go_on_and_may_use_all_cores(folder, monkeypatch):
+    monkeypatch.setattr("mrstrain.measurement.label_command._TOLD_EVERY_S", 0.05)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    (folder / "slow.py").write_text(
+        "import os, shutil, sys, time\ntime.sleep(1.0)\nassert 'OMP_NUM_THREADS' not in os.environ\n"
+        "shutil.copy('drawn.nii.gz', sys.argv[1])\n"
+    )
+    told, command = list[float](), f"'{sys.executable}' slow.py {{labels}} {{image}}"
+    out = folder / "results" / "tissues.nii.gz"
+    labelled_by_command(folder / "Load0.nii.gz", command, folder / "drawn.csv", out, watch=told.append)
+    assert len(told) > 4
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
 def test_a_study_runs_it_as_its_first_stage(folder):
     (folder / "study.toml").write_text(STUDY)
     stage = plan(read_study(folder))[0]
     assert stage.name == "label"
     assert stage.arguments["command"] == "segment {image} {labels}"
     assert [path.name for path in stage.files] == ["Load0.nii.gz", "drawn.csv"]
+    script = STUDY.replace("segment {image}", "/opt/a/python segment.py {image}")
+    (folder / "study.toml").write_text(script)
+    first = plan(read_study(folder))[0]
+    assert [path.name for path in first.files] == ["Load0.nii.gz", "drawn.csv", "segment.py"]
+    (folder / "study.toml").write_text(script.replace("/opt/a", "/opt/b"))  # folders do not count, the hash does
+    ledger = Ledger(folder / "results", folder)
+    keys = [ledger.made_from(stage, stage.arguments)["arguments"] for stage in (first, plan(read_study(folder))[0])]
+    assert keys[0]["command"] == keys[1]["command"]
+    assert keys[0] != keys[1]
+    (folder / "study.toml").write_text(STUDY.replace('bone = "bone"', 'bone = "calcaneus"'))
+    assert "has no label 'calcaneus'; it has bone, fat" in "\n".join(check(folder).wrong)
     for old, new, told in (
         ('"auto"', '"drawn.nii.gz"', "only for labels"),
         (" {labels}", "", "needs {labels}"),
