@@ -320,11 +320,10 @@ class Measurement:
         tables = [replace(page.key_figures(self.quality, self.alignment), note=notes), page.region_table(self.regions)]
         tables += [] if self.is_repeat else weights
         tables += page.error_tables(bars)
-        first = [pictures[stem] for stem in ("strain", "curves")]
-        others = [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
+        shown = [pictures[stem] for stem in ("strain", "curves")]
+        shown += [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
         short = page.summary_table(self.regions, self.intervals)
-        pictured = (*first, *others)
-        return Section(self.name, self.verdict, tuple(tables), pictured, pictures_first=True, summary=short)
+        return Section(self.name, self.verdict, tuple(tables), tuple(shown), pictures_first=True, summary=short)
 
     def drawings(self) -> dict[str, Drawing]:
         """The figures of a report, by the name of their files; InputError for one that was read from a folder."""

@@ -50,10 +50,8 @@ def labelled_by_command(
     InputError, GeometryError
         If its label map cannot be read, or does not lie on the image.
     """
-    files, image = (
-        LabelFiles.of(out, [path for path in (load0, names) if path is not None]),
-        read_image(load0, allow_missing=True),
-    )
+    inputs = {"load0": load0} | ({} if names is None else {"names": names})
+    files, image = LabelFiles.of(out, [*inputs.values()]), read_image(load0, allow_missing=True)
     watch(0.0)
     with files.alone():
         made = files.beside("_of_command.nii.gz")
@@ -66,7 +64,6 @@ def labelled_by_command(
         files.remove_probability()  # of an earlier label map
         write_labels(files.labels, labels)
         picture = Drawing.of("Tissues", tissue_slices, view_of(labels), image, labels).save(files.stem)
-        inputs = {"load0": load0} | ({} if names is None else {"names": names})
         write_json(files.beside(".json"), provenance("label", inputs, {"command": command, "sha256": sha256}))
     watch(1.0)
     volumes = volumes_ml(labels)
@@ -101,10 +98,9 @@ def _run(command: str, image: Path, labels: Path, watch: Callable[[float], None]
 def _watched(given: Sequence[str], place: Path, watch: Callable[[float], None]) -> tuple[int, str]:
     """Status of a command, and what it printed; it may use all cores, and ends with this block."""
     free = {name: value for name, value in os.environ.items() if name not in _ONE_THREAD}
-    both = subprocess.PIPE, subprocess.STDOUT
-    began = time.monotonic()
+    began, both = time.monotonic(), subprocess.STDOUT
     with subprocess.Popen(
-        given, cwd=place, env=free, stdout=both[0], stderr=both[1], text=True, errors="replace"
+        given, cwd=place, env=free, stdout=subprocess.PIPE, stderr=both, text=True, errors="replace"
     ) as running:  # fmt: skip
         try:
             while True:
