@@ -22,7 +22,6 @@ from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.label import label
 from mrstrain.measurement.plan import Plan, record_of
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
@@ -163,6 +162,8 @@ def _labelled(
     load0: Path, files: SubjectFiles, out: Path, tell: Callable[[float], None]
 ) -> tuple[SubjectFiles, tuple[Section, ...]]:
     """Make the label map; the files with it, and its section of the report."""
+    from mrstrain.measurement.label import label  # with it come skimage.restoration and scipy.stats: 0.7 s
+
     labels, names = made_labels(out)
     tell(0.0)
     made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, watch=tell)
