@@ -139,8 +139,8 @@ def register(
         run.all(at_once, registration.chain, first)
         finished = run.finished()
     shown = [case for case in finished if case.name != REPEAT]
-    first = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
-    return Series.of(target, finished, run.failures, record, first, of_labels)
+    answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
+    return Series.of(target, finished, run.failures, record, answer, of_labels)
 
 
 def _hold(out: Path, stack: ExitStack) -> None:
