@@ -6,7 +6,8 @@ from pathlib import Path
 from dvc import Subject
 from dvc.report.page import Section, Table
 
-_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration, with the 95 % confidence interval in brackets."
+_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
+_INTERVALS = ", with the 95 % confidence interval in brackets"
 
 
 def measured_strain(
@@ -32,4 +33,5 @@ def table_of_loads(measured: Sequence[Section]) -> Table | None:
     if not tables:
         return None
     rows = tuple((load, *row) for load, of in tables for row in of.rows)
-    return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, _NOTE)
+    note = _NOTE.format(_INTERVALS if any(of.note for _, of in tables) else "")
+    return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, note)
