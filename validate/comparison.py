@@ -17,6 +17,7 @@ from dvc.file_names import refuse_as_file_name
 from dvc.own_files import read_json
 from dvc.report.drawing import png_bytes
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
+from dvc.report.strips import Strip
 from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, tables
@@ -29,7 +30,6 @@ from validate.mapping import ALL
 from validate.misfit import check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import Drawn, area_rows, closing_sections, draw, drawings_of_all, load_sections, overview, shown
-from validate.strain_by_load import Strip
 from validate.tables import Curve
 
 _COVERED = 0.9  # fraction of the mesh; a model that covers less is noted

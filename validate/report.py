@@ -11,6 +11,7 @@ from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
 from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
+from dvc.report.strips import MEASURED, Strip, strain_by_load
 from validate import figures
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
@@ -19,7 +20,7 @@ from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
 from validate.ranking import ALL_LOADS, Ranking, no_nearer
-from validate.strain_by_load import MEASURED, Strip, strain_by_load
+from validate.strip import strip_of
 from validate.tables import Curve
 
 _AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
@@ -84,7 +85,7 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
         bins = figures.difference_bins(fields, quantity)
         data = figures.columns_of(bins, f"mean_{name}", f"difference_{name}")
         drawings[stem] = Drawing.of(title, figures.differences, bins, one, quantity, data=data)
-    return drawings, _viewer(one, measured, results, image), Strip.of(one, measured, results, lowest)
+    return drawings, _viewer(one, measured, results, image), strip_of(one, measured, results, lowest)
 
 
 def _place(one: LoadComparison) -> str:
@@ -155,13 +156,10 @@ def drawings_of_all(
 ) -> dict[str, Drawing]:
     """The first figures of a report, by the stem of their files: slices and curves under all loads."""
     model = ranking.areas[0].model if ranking.areas else next(n for n in strips[0].max_shear if n != MEASURED)
-    pages = [strip.max_shear[name] for strip in strips for name in (MEASURED, model) if name in strip.max_shear]
-    known = np.concatenate([page[np.isfinite(page)] for page in pages])
-    highest = max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
     informative = ranking.areas and ALL_LOADS not in ranking.uninformative
     best = "the best match over all loads" if informative else "a model"
-    note = f"Lower row: {model}, {best}. {strips[0].title}, through {strips[0].place}."
-    slices, of_all = (strips, model, highest), [curve for curve in curves if curve.tissue == ALL]
+    note = f"Upper row: measured. Lower row: {model}, {best}. {strips[0].title}, through {strips[0].place}."
+    slices, of_all = (strips, (MEASURED, model)), [curve for curve in curves if curve.tissue == ALL]
     return {
         "slices_by_load": Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note),
         "curves_by_load": Drawing.of("Strain-volume curves, all soft tissue", figures.curves_by_load, of_all, strains),

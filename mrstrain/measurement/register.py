@@ -20,6 +20,7 @@ from dvc.report.page import Section
 from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
+from mrstrain.measurement.answer import measured_strain
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.plan import Plan, record_of
@@ -136,7 +137,9 @@ def register(
             _hold(target, stack)
         run.all(at_once, registration.chain, first)
         finished = run.finished()
-    return Series.of(target, finished, run.failures, record, of_labels)
+    shown = [case for case in finished if case.name != REPEAT]
+    answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
+    return Series.of(target, finished, run.failures, record, answer, of_labels)
 
 
 def _hold(out: Path, stack: ExitStack) -> None:
