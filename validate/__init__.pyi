@@ -1,6 +1,15 @@
 from .agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from .comparison import Comparison, compare
 from .curves import RANGE, Area, Band, area_between, bands, check_range
+from .decomposition import (
+    Decomposition,
+    Reconstruction,
+    Representation,
+    TissueBasis,
+    decompose,
+    probability_of_representation,
+    representation,
+)
 from .extrapolation import LEVELLED, extrapolated
 from .fe_result import FeResult, check_overlap, read_result
 from .figures import over_subjects
@@ -15,11 +24,12 @@ from .tables import Curve
 
 __all__ = [
     "ALL", "ALL_LOADS", "LEAST_ML", "LEVELLED", "NOTHING", "RANGE", "Agreement", "Area", "Band", "CellGraph",
-    "CohortRank", "Comparison", "Criteria", "Curve", "FeResult", "Field", "GeometryError", "InputError", "LoadCase",
-    "LoadComparison", "MappedFields", "OutputError", "Overlap", "Ranking", "SkinDisplacement", "StrainCluster",
-    "Threshold", "agreements", "area_between", "bands", "boundary_displacement", "check_bones", "check_in_tissue",
-    "check_models", "check_overlap", "check_range", "compare", "compare_load", "displacement_slip", "extrapolated",
-    "filled_from_nearest", "map_fields", "misfits", "over_subjects", "overlap", "rank_over_loads",
-    "rank_over_subjects", "read_result", "read_thresholds", "simulate_driven", "skin_displacement",
-    "write_boundary_conditions",
+    "CohortRank", "Comparison", "Criteria", "Curve", "Decomposition", "FeResult", "Field", "GeometryError",
+    "InputError", "LoadCase", "LoadComparison", "MappedFields", "OutputError", "Overlap", "Ranking",
+    "Reconstruction", "Representation", "SkinDisplacement", "StrainCluster", "Threshold", "TissueBasis",
+    "agreements", "area_between", "bands", "boundary_displacement", "check_bones", "check_in_tissue",
+    "check_models", "check_overlap", "check_range", "compare", "compare_load", "decompose", "displacement_slip",
+    "extrapolated", "filled_from_nearest", "map_fields", "misfits", "over_subjects", "overlap",
+    "probability_of_representation", "rank_over_loads", "rank_over_subjects", "read_result", "read_thresholds",
+    "representation", "simulate_driven", "skin_displacement", "write_boundary_conditions",
 ]  # fmt: skip
