@@ -12,11 +12,13 @@ from validate import (
     CellGraph,
     Decomposition,
     Reconstruction,
+    Representation,
     TissueBasis,
     decompose,
     probability_of_representation,
     representation,
 )
+from validate.decomposition import MOST_DEGREE
 
 SIDE = 20.0
 
@@ -27,6 +29,11 @@ def cells(n: int = 8) -> CellGraph:
     points = made.points_mm.copy()
     points[:, 0] = points[:, 0] ** 2 / SIDE
     return CellGraph.of(replace(made, points_mm=points))
+
+
+def decomposed(values: np.ndarray, models: dict[str, np.ndarray], graph: CellGraph, u_cal: float) -> Decomposition:
+    """With true fields that are all the measured one."""
+    return decompose(values, models, graph, u_cal, np.stack([values, values]))
 
 
 def gram(basis: TissueBasis) -> np.ndarray:
@@ -94,16 +101,16 @@ def test_as_many_functions_are_taken_as_the_measurement_needs() -> None:
     x, y, _ = graph.points_mm.T / SIDE
     values = 0.2 + 0.1 * x + 0.4 * (x - 0.5) ** 3 * y
     noise = 0.004 * np.random.default_rng(2).standard_normal(len(values))
-    exact, coarse = decompose(values, {}, graph, 1e-9), decompose(values + noise, {}, graph, 0.1)
+    exact, coarse = decomposed(values, {}, graph, 1e-9), decomposed(values + noise, {}, graph, 0.1)
     assert (exact.degree, exact.accepted) == (4, True)
     assert coarse.degree < 4
-    noisy = decompose(values + noise, {}, graph, 0.0041)
+    noisy = decomposed(values + noise, {}, graph, 0.0041)
     assert noisy.accepted
     assert noisy.measured.residual == pytest.approx(0.004, rel=0.05)
     assert noisy.degree <= 4
-    hopeless = decompose(values + noise, {}, graph, 0.002)
+    hopeless = decomposed(values + noise, {}, graph, 0.002)
     assert not hopeless.accepted
-    assert hopeless.degree == 8
+    assert hopeless.degree == MOST_DEGREE
 
 
 def test_a_cluster_of_residuals_is_not_accepted_although_their_mean_is_small() -> None:
@@ -122,12 +129,12 @@ def test_a_cluster_of_residuals_is_not_accepted_although_their_mean_is_small() -
     assert loose.accepted(0.05)
 
 
-def test_the_band_joins_the_uncertainty_of_measurement_and_reconstruction() -> None:
-    some = Decomposition(1, Reconstruction(np.zeros(4), 0.03, 0), {}, 0.04)
-    assert some.uncertainty == pytest.approx(0.05)
-    assert some.expanded == pytest.approx(0.1)
+def test_the_guides_band_joins_the_uncertainty_of_measurement_and_reconstruction() -> None:
+    some = Decomposition(1, Reconstruction(np.zeros(4), 0.03, 0), {}, 0.04, np.zeros(4), np.full(4, 0.01))
+    assert some.guide_band == pytest.approx(0.1)
+    assert some.band == pytest.approx(np.full(4, 0.02))
     assert some.accepted
-    assert not replace(some, measurement_uncertainty=0.02).accepted
+    assert not replace(some, u_cal=0.02).accepted
 
 
 def test_the_probability_is_the_share_of_errors_within_the_uncertainty() -> None:
@@ -142,17 +149,41 @@ def test_the_probability_is_the_share_of_errors_within_the_uncertainty() -> None
     assert mixed != pytest.approx(0.75, abs=0.1)
 
 
-def test_a_model_off_in_one_mode_lies_in_the_band_for_all_others() -> None:
+def test_a_model_off_in_one_mode_is_in_the_guides_band_for_all_others() -> None:
     graph = cells(10)
     basis = TissueBasis.of(graph.points_mm, graph.volumes_ml, 3)
     measured = 0.2 + 0.05 * basis.functions[:, 12]
     models = {"same": measured, "off": measured + 0.1 * basis.functions[:, 5], "near": 1.1 * measured}
-    found = decompose(measured, models, graph, 0.02)
+    found = decomposed(measured, models, graph, 0.02)
     rows = {name: representation((name, "Load1", "fat"), found) for name in models}
-    assert rows["same"].within
-    assert rows["same"].probability == 1.0
-    assert rows["off"].in_band == rows["off"].coefficients - 1
-    assert rows["off"].probability == pytest.approx(0.0, abs=1e-9)
-    assert rows["near"].within  # its mean is off by 0.02, and all within twice 0.02
+    assert (rows["same"].in_guide_band, rows["same"].guide_probability) == (20, 1.0)
+    assert (rows["off"].in_guide_band, rows["off"].guide_probability) == (19, pytest.approx(0.0, abs=1e-9))
+    assert rows["near"].in_guide_band == 20  # its mean is off by 0.02, and all within twice 0.02
     assert rows["off"].accepted
     assert not replace(rows["off"], clusters=1).accepted
+
+
+def test_uncertainty_carried_to_each_coefficient_covers_and_has_the_power_that_the_guides_lacks() -> None:
+    """True fields differ by a bias and by white noise, which changes a coefficient by sd / n^(1/2) alone."""
+    graph, random = cells(6), np.random.default_rng(6)
+    basis = TissueBasis.of(graph.points_mm, graph.volumes_ml, 3)
+    mode, sd, bias = 0.05 * basis.functions[:, 12], 0.04, 0.03
+    truth = 0.2 + mode
+    models = {"true": truth, "other": truth - mode, "biased-levelled": truth + bias, "biased": truth + bias}
+    spread = sd * np.sqrt(((basis.functions[:, 3] * basis.weights) ** 2).sum())
+    rows: list[Representation] = []
+    for _ in range(30):
+        measured = truth + bias + sd * random.standard_normal(len(truth))
+        truths = measured - bias - sd * random.standard_normal((100, len(truth)))
+        found = decompose(measured, models, graph, 0.06, truths)
+        assert found.spread[3] == pytest.approx(spread, rel=0.3)
+        wide = decompose(measured, models, graph, 0.06, truths, widening=3.0)
+        assert wide.spread == pytest.approx(3.0 * found.spread)
+        rows += [representation((name, "Load1", "fat"), found) for name in models]
+    within = {name: np.mean([r.in_band / r.coefficients for r in rows if r.model == name]) for name in models}
+    assert within["true"] == pytest.approx(0.95, abs=0.025)
+    assert within["biased-levelled"] == pytest.approx(0.95, abs=0.025)  # the measured field keeps its bias for it
+    assert within["biased"] < within["true"] - 0.03  # the mean alone is off
+    probable = {name: np.mean([r.probability for r in rows if r.model == name]) for name in models}
+    assert probable["other"] < 0.4 < 0.7 < probable["true"]
+    assert all(r.guide_probability == 1.0 for r in rows)  # any model is in its band
