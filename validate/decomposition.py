@@ -277,11 +277,12 @@ def representation(of: tuple[str, str, str], by: Decomposition) -> Representatio
     """The row ``of`` a model, load and tissue; no bias is removed for a levelled model, which has it too."""
     measured, model = by.measured, by.models[of[0]].coefficients
     centre = measured.coefficients if of[0].endswith(LEVELLED) else by.estimate
-    bands = (centre, by.band), (measured.coefficients, np.full(len(model), by.guide_band))
-    found: list[float] = []
-    for about, band in bands:
-        found += [int(np.count_nonzero(np.abs(model - about) <= band)), probability_of_representation(about, model, band)]
+    guide = measured.coefficients, np.full(len(model), by.guide_band)
+    (inside, probability), (in_guide, by_guide) = (
+        (int(np.count_nonzero(np.abs(model - at) <= band)), probability_of_representation(at, model, band))
+        for at, band in ((centre, by.band), guide)
+    )
     return Representation(
         *of, len(model), by.degree, by.u_cal, measured.residual, measured.clusters, by.models[of[0]].residual,
-        by.models[of[0]].clusters, int(found[0]), found[1], int(found[2]), found[3],
+        by.models[of[0]].clusters, inside, probability, in_guide, by_guide,
     )  # fmt: skip
