@@ -23,10 +23,12 @@ from dvc.worker import Each
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
+from validate.decomposition import Representation
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
 from validate.location import Overlap
 from validate.mapping import ALL
+from validate.mavm import ModelForm
 from validate.misfit import check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import Drawn, area_rows, closing_sections, draw, drawings_of_all, load_sections, overview, shown
@@ -44,6 +46,8 @@ class Comparison:
     areas, overlaps, agreements, skin : tuple of Area, Overlap, Agreement, SkinDisplacement
         Rows by load and model: area between strain-volume curves by tissue, location of clusters above thresholds,
         agreement cell by cell, displacement of the skin.
+    representations, model_forms : tuple of Representation, ModelForm
+        Rows by load, model and tissue: image decomposition (CWA 16799), modified area validation metric.
     curves : tuple of Curve
         Strain-volume curves, measured and simulated.
     ranking : Ranking
@@ -65,6 +69,8 @@ class Comparison:
     overlaps: tuple[Overlap, ...]
     agreements: tuple[Agreement, ...]
     skin: tuple[SkinDisplacement, ...]
+    representations: tuple[Representation, ...]
+    model_forms: tuple[ModelForm, ...]
     curves: tuple[Curve, ...]
     ranking: Ranking
     strains: tuple[float, float]
@@ -190,7 +196,8 @@ class Comparison:
         levels = {load: of.level for load, of in known.items()}
         levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
         areas, ranking = (*self.areas, *self.ranking.areas, self.ranking.nothing), self.ranking
-        tables.write_tables(target, (areas, self.overlaps, self.agreements, self.skin), self.curves, levels)
+        rows = areas, self.overlaps, self.agreements, self.skin, self.representations, self.model_forms
+        tables.write_tables(target, rows, self.curves, levels)
         own: dict[str, object] = {
             "total_area_ml": {a.model: a.best_ml for a in ranking.areas}, "told_apart": list(ranking.statements),
             "not_told_apart": ranking.not_distinguishable, "notes": list(self.notes), "coverage_ml": self.coverage_ml,
@@ -212,7 +219,7 @@ class Comparison:
             If the folder does not contain a comparison.
         """
         place = Path(folder)
-        areas, overlaps, agreements, skin = tables.read_tables(place)
+        areas, overlaps, agreements, skin, represented, forms = tables.read_tables(place)
         try:
             content = read_json(place / tables.RECORD)
             low, high = content["parameters"]["strains"]
@@ -225,9 +232,8 @@ class Comparison:
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{place / tables.RECORD} is not a valid record of a comparison ({error}).") from error
         by_load, curves = tuple(a for a in areas if a.load != ALL_LOADS), tables.read_curves(place)
-        return cls(
-            by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes
-        )
+        rows = by_load, overlaps, agreements, skin, represented, forms
+        return cls(*rows, curves, ranking, (low, high), coverage, verdict, verdicts, notes)
 
 
 def _write_load(
@@ -300,6 +306,8 @@ def compare(
         overlaps=tuple(o for one in loads for o in one.overlaps),
         agreements=tuple(a for one in loads for a in one.agreements),
         skin=tuple(s for one in loads for s in one.skin),
+        representations=tuple(r for one in loads for r in one.representations),
+        model_forms=tuple(m for one in loads for m in one.model_forms),
         curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
         ranking=rank_over_loads(loads), strains=by.strains, coverage_ml=coverage, verdict=verdict, verdicts=verdicts,
         notes=(*notes, *_doubts(verdict), *_limitations(loads)), warnings=tuple(odd), loads=tuple(loads),

@@ -12,7 +12,7 @@ from dvc.io.images.read import read_voxels
 from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from dvc.report.strips import MEASURED, Strip, strain_by_load
-from validate import figures
+from validate import figures, standards
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
 from validate.fe_result import FeResult
@@ -28,6 +28,7 @@ _DIFFERENCES = (  # stem of the files, quantity, its name with its unit in the c
     ("differences_shear", "max_shear", "max_shear", "Differences of maximum shear strain"),
     ("differences_u", "u_mm", "displacement_mm", "Differences of displacement magnitude"),
 )
+_COEFFICIENTS = "coefficients"  # stem of the files
 _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
 _CLOSING = Section(
     "How to read this",
@@ -85,6 +86,8 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
         bins = figures.difference_bins(fields, quantity)
         data = figures.columns_of(bins, f"mean_{name}", f"difference_{name}")
         drawings[stem] = Drawing.of(title, figures.differences, bins, one, quantity, data=data)
+    if (of_coefficients := standards.drawing(one, models)) is not None:
+        drawings[_COEFFICIENTS] = of_coefficients
     return drawings, _viewer(one, measured, results, image), strip_of(one, measured, results, lowest)
 
 
@@ -136,18 +139,19 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
 
 
 def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: Viewer) -> list[Section]:
-    """Sections of a load: amount and location of strain, then agreement cell by cell."""
+    """Sections of a load: amount and location of strain, agreement cell by cell, and what the standards ask for."""
     verdict = one.case.verdict
     words = [
         "Compared volume: {common:.1f} mL of {mesh:.1f} mL of soft tissue in the mesh; the measurement is defined in "
         "{measured:.1f} mL.".format(**one.fields.coverage())
     ]
     words += [] if verdict is None else [f"Verdict on the registration: {verdict.words}."]
-    curves, slices, *others = pictures.values()
+    curves, slices, *others = (picture for stem, picture in pictures.items() if stem != _COEFFICIENTS)
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
         Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
         Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others), folded=True),
+        standards.section(one, pictures.get(_COEFFICIENTS)),
     ]
 
 
