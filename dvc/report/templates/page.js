@@ -25,5 +25,5 @@ document.querySelectorAll(".faders").forEach((faders) => {
 document.querySelectorAll(".enlarge").forEach((button) => button.addEventListener("click", () => {
   const picture = button.parentElement.querySelector(".stack"), large = picture.classList.toggle("large");
   picture.tabIndex = large ? 0 : -1;
-  button.setAttribute("aria-pressed", large);
+  button.textContent = large ? "Show the whole picture" : "Enlarge the picture";
 }));

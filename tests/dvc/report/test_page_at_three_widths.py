@@ -133,7 +133,9 @@ def test_a_picture_is_seen_whole_and_can_be_enlarged_on_a_telephone(tab: Tab, pa
         assert tab.value(f"{box}.scrollWidth > 1.5 * {box}.clientWidth")
         assert tab.value(f"{box}.tabIndex") == 0
     assert tab.value(TOO_WIDE) <= 0
+    assert tab.value(f"{button}.textContent") == "Show the whole picture"
     tab.value(f"{button}.click()")
+    assert tab.value(f"{button}.textContent") == "Enlarge the picture"
     assert tab.value(CUT_OFF) == []
     assert tab.said == []
 
