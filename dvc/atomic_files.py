@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -71,19 +72,33 @@ def whole_folder(final: Path) -> Iterator[Path]:
         try:
             partial.chmod(0o755)
             yield partial
-            if not final.exists():
-                partial.replace(final)
-                return
-            name = f".{final.name}."
-            with tempfile.TemporaryDirectory(".old", name, final.parent, ignore_cleanup_errors=True) as aside:
-                old = final.replace(Path(aside) / final.name)
-                try:
-                    partial.replace(final)
-                except OSError:
-                    old.replace(final)
-                    raise
+            _put_in_place(partial, final)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+        _remove_left(final)
     except OSError as error:
         advice = "Check the permissions of the folder and the disk space. No incomplete results were left."
         raise OutputError(f"{final}: results cannot be written ({error.strerror or error}). {advice}") from error
+
+
+def _put_in_place(partial: Path, final: Path) -> None:
+    """Give a folder its final name; an older one of that name stays until then."""
+    if not final.exists():
+        partial.replace(final)
+        return
+    name = f".{final.name}."
+    with tempfile.TemporaryDirectory(".old", name, final.parent, ignore_cleanup_errors=True) as aside:
+        old = final.replace(Path(aside) / final.name)
+        try:
+            partial.replace(final)
+        except OSError:
+            old.replace(final)
+            raise
+
+
+def _remove_left(final: Path) -> None:
+    """Remove what processes that were killed had begun to write as this folder, or had put aside for it."""
+    left = re.compile(rf"\.{re.escape(final.name)}\.\w{{8}}\.(partial|old)")
+    for folder in final.parent.iterdir():
+        if left.fullmatch(folder.name):
+            shutil.rmtree(folder, ignore_errors=True)

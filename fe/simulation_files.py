@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
-from dvc.atomic_files import whole_file, write_json
+from dvc.atomic_files import remove_partial, whole_file, write_json
 from dvc.errors import InputError
 from dvc.mesh import outer_faces
 from dvc.own_files import read_arrays, read_json
@@ -103,6 +103,7 @@ def begin_simulation(folder: Path) -> None:
     of_loads = [name for load in loads for name in (f"{load}.vtu", f"{load}.inp", f"{load}.feb", f"log-{load}.txt")]
     for name in (*of_loads, *_TABLES):
         (folder / name).unlink(missing_ok=True)
+    remove_partial(folder)
     write_json(folder / RECORD, {"outcome": {}})
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import fe
-from dvc.atomic_files import remove_partial, write_whole
+from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError, OutputError, WorkerError
 from dvc.file_names import clash
 from dvc.own_files import read_json
@@ -134,7 +134,6 @@ def simulate(
 def _remove_earlier(folder: Path, loads: Collection[str]) -> None:
     """Remove the results of an earlier simulation; checkpoints of the current loads are kept."""
     fe.begin_simulation(folder)
-    remove_partial(folder)
     for left in folder.glob(f"*{ENDING}"):
         if left.name.removesuffix(ENDING) not in loads:
             left.unlink()

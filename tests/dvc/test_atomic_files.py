@@ -61,3 +61,16 @@ def test_a_folder_that_cannot_take_its_name_gives_it_back(old: Path, monkeypatch
         (partial / "regions.csv").write_text("new")
     assert [p.name for p in old.parent.iterdir()] == ["Load1"]
     assert (old / "quality.json").read_text() == "old"
+
+
+def test_folders_that_a_killed_process_left_go_with_the_next(tmp_path: Path) -> None:
+    final, beside = tmp_path / "Load1", [".Load1.a.12345678.partial", ".Load1.lock", ".Load12.12345678.partial"]
+    for name in (".Load1.ab_45678.partial", ".Load1.12345678.old", *beside):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "displacement.nii.gz").write_text("half")
+    with pytest.raises(KeyboardInterrupt), whole_folder(final):
+        raise KeyboardInterrupt
+    assert len(list(tmp_path.iterdir())) == 5  # an older result may be among them
+    with whole_folder(final) as part:
+        (part / "displacement.nii.gz").write_text("whole")
+    assert {path.name for path in tmp_path.iterdir()} == {"Load1", *beside}
