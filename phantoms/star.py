@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from dvc import Deformation, Grid, Image, LabelMap
 from dvc.arrays import FloatArray
@@ -20,7 +21,7 @@ RECOVERED = 0.9
 """Fraction of the amplitude that is recovered at the spatial resolution: a bias of 10 %."""
 
 _CENTRE_MM = np.array([400.0, 0.0, 0.0])  # far from the tendons of the heel, whose textures the block has
-_SHAPE, _SPACING_MM = (200, 64, 64), 0.8
+_SHAPE, _SPACING_MM = (160, 56, 56), 0.8
 _AMPLITUDE_MM, _PERIODS_MM = 0.6, (4.0, 40.0)
 _FAR_MM, _FLAT_MM = 1e5, 2e4  # to bodies that are not in the block, and radius of the plane between its tissues
 _MARGIN_MM, _INTERFACE_MM = 8.0, 4.0  # from the faces of the block, and from the interface, that are not sampled
@@ -184,13 +185,19 @@ _QUANTITIES = ("displacement", "strain")
 def resolved_mm(periods_mm: Sequence[float], recovered: Sequence[float], share: float = RECOVERED) -> float:
     """Shortest period (mm) from which on a share is recovered, linear between rising periods; NaN if there is none.
 
+    Noise aside, longer periods are recovered better: it is read from the rising curve that fits best (isotonic
+    regression).
+
     Examples
     --------
     >>> resolved_mm([5.0, 10.0, 20.0, 40.0], [0.2, 0.8, 1.0, 1.0])
     15.0
     """
-    length, of = np.asarray(periods_mm), np.asarray(recovered)
-    below = np.flatnonzero(~(of >= share))
+    length, given = np.asarray(periods_mm), np.asarray(recovered)
+    if not np.isfinite(given).all():
+        return float("nan")
+    of = isotonic_regression(given).x
+    below = np.flatnonzero(of < share)
     if not len(below) or below[-1] == len(of) - 1:
         return float("nan")
     i = int(below[-1])

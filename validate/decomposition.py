@@ -197,7 +197,7 @@ def decompose(
     References
     ----------
     CWA 16799:2014, Validation of computational solid mechanics models.
-    Christian, Dean, Dvurecenska, Middleton and Patterson, R Soc Open Sci 2021, doi:10.1098/rsos.210916 (functions).
+    Christian and others, R Soc Open Sci 2021 (adaptive geometric moment descriptors: the functions).
     """
     for basis in TissueBasis.rising(cells.points_mm, cells.volumes_ml):
         found = Reconstruction.of(measured, basis, cells)

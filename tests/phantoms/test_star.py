@@ -110,6 +110,9 @@ def test_noise_and_bias_are_those_of_the_pair_without_motion(pair: StarPair) -> 
 
 
 def test_the_resolution_is_that_from_which_on_all_is_recovered() -> None:
-    assert resolved_mm([5.0, 10.0, 20.0], [0.95, 0.8, 1.0]) == pytest.approx(15.0)  # not that at which it first is
+    assert resolved_mm([5.0, 10.0, 20.0], [0.2, 0.8, 1.0]) == pytest.approx(15.0)
+    noisy = [0.2, 0.6, 0.88, 0.96, 0.89, 0.97, 1.0]  # noise of a few percent does not make 11 mm of 6
+    assert resolved_mm([5.0, 7.0, 9.0, 11.0, 13.0, 15.0, 17.0], noisy) == pytest.approx(9.8, abs=0.2)
+    assert np.isnan(resolved_mm([5.0, 10.0], [np.nan, 1.0]))
     assert np.isnan(resolved_mm([5.0, 10.0], [0.95, 0.99]))
     assert np.isnan(resolved_mm([5.0, 10.0], [0.5, 0.8]))
