@@ -40,18 +40,20 @@ from .heel import (
     under_load,
     under_plate,
 )
-from .motions import Bending, ShearWave, compressed, sheared, stretched
+from .motions import Bending, ShearStar, ShearWave, compressed, sheared, stretched
 from .mri import acquire, sensitivity
+from .star import Efficiency, StarPair, StarRow, efficiencies, resolved_mm, star_pair, star_rows, tissue_block
 from .warp import Acquisition, SyntheticWarp, material_points, synthetic_warp
 
 __all__ = [
     "FAT_SIGNAL", "LOADS", "RIGID", "SOFT", "TISSUES", "AccuracyCase", "Acquisition", "Bending", "Border",
-    "CoverageRow", "EllipsoidUnion", "ErrorRow", "ErrorSamples", "FloorRow", "Flow", "GeometryError", "Heel",
-    "HeelPair", "InputError", "MrstrainError", "ResolutionRow", "RunRow", "ShearWave", "SyntheticWarp",
-    "TissueError", "acquire", "centred_grid", "compressed", "coverage_rows", "covering", "default_foot_motion",
-    "distances_mm", "error_rows", "errors_by_tissue", "errors_of_maps", "figures", "fit_error_model",
-    "floor_rows", "heel_grid", "heel_pair", "labels_of", "labels_to_mesh", "material_points", "measure_run",
-    "misdrawn", "motion_named", "pressed", "random_foot_motion", "resolution_rows", "run_rows", "scan",
-    "sensitivity", "sheared", "sliding", "stretched", "swelling", "synthetic_warp", "under_load", "under_plate",
-    "wavelength_recovered",
+    "CoverageRow", "Efficiency", "EllipsoidUnion", "ErrorRow", "ErrorSamples", "FloorRow", "Flow",
+    "GeometryError", "Heel", "HeelPair", "InputError", "MrstrainError", "ResolutionRow", "RunRow", "ShearStar",
+    "ShearWave", "StarPair", "StarRow", "SyntheticWarp", "TissueError", "acquire", "centred_grid", "compressed",
+    "coverage_rows", "covering", "default_foot_motion", "distances_mm", "efficiencies", "error_rows",
+    "errors_by_tissue", "errors_of_maps", "figures", "fit_error_model", "floor_rows", "heel_grid", "heel_pair",
+    "labels_of", "labels_to_mesh", "material_points", "measure_run", "misdrawn", "motion_named", "pressed",
+    "random_foot_motion", "resolution_rows", "resolved_mm", "run_rows", "scan", "sensitivity", "sheared",
+    "sliding", "star_pair", "star_rows", "stretched", "swelling", "synthetic_warp", "tissue_block",
+    "under_load", "under_plate", "wavelength_recovered",
 ]  # fmt: skip

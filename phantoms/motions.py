@@ -118,6 +118,86 @@ class ShearWave:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ShearStar:
+    """Simple shear in waves whose period grows along an axis, as the star of the DIC Challenge 2.0, in 3D.
+
+    u = A cos(2 pi y / p) d with y = n . (X - c). The period p is linear in s = a . (X - c), from the shortest at
+    s = -L/2 to the longest at L/2, and constant beyond. On the middle plane, y = 0, the displacement is A everywhere.
+    With d across n and a, det F = 1, and the inverse is the same star with the opposite sign.
+
+    Parameters
+    ----------
+    centre_mm : (3,)
+        c, LPS mm.
+    along, normal : (3,)
+        a and n, orthogonal unit vectors; d = a x n.
+    amplitude_mm : float
+        A, mm.
+    shortest_mm, longest_mm, length_mm : float
+        Periods at both ends, and L, mm.
+
+    Raises
+    ------
+    InputError
+        If a length is not positive, or the directions are not orthogonal unit vectors.
+
+    References
+    ----------
+    Reu and others, DIC Challenge 2.0, Exp Mech 2022, doi:10.1007/s11340-021-00806-6.
+    """
+
+    centre_mm: FloatArray
+    along: FloatArray
+    normal: FloatArray
+    amplitude_mm: float
+    shortest_mm: float
+    longest_mm: float
+    length_mm: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centre_mm", frozen(self.centre_mm, np.float64))
+        for name, vector in zip(("along", "normal"), _frame(self.along, self.normal), strict=True):
+            object.__setattr__(self, name, vector)
+        lengths = self.shortest_mm, self.longest_mm, self.length_mm
+        if not (np.isfinite([*lengths, self.amplitude_mm]).all() and min(lengths) > 0):
+            raise InputError(f"A star needs positive periods and a positive length in mm; got {lengths}.")
+
+    @property
+    def direction(self) -> FloatArray:
+        """d, the direction of the displacement, a unit vector."""
+        return np.cross(self.along, self.normal)
+
+    def period_mm(self, points_mm: FloatArray) -> FloatArray:
+        """Period p (n,) at points (n, 3) LPS mm."""
+        return self._period(as_points(points_mm))[0]
+
+    def _period(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The period, mm, and its slope along the axis."""
+        part = (points - self.centre_mm) @ self.along / self.length_mm + 0.5
+        slope = (self.longest_mm - self.shortest_mm) / self.length_mm
+        inside = (part > 0.0) & (part < 1.0)
+        return self.shortest_mm + slope * self.length_mm * np.clip(part, 0.0, 1.0), np.where(inside, slope, 0.0)
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        """u(X), (n, 3) mm, at points X (n, 3) LPS mm."""
+        return self.evaluate(points_mm)[0]
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """u(X) (n, 3) mm and H (n, 3, 3) at points X (n, 3) LPS mm."""
+        points = as_points(points_mm)
+        (period, slope), y = self._period(points), (points - self.centre_mm) @ self.normal
+        angle = 2.0 * np.pi * y / period
+        steep = (2.0 * np.pi / period)[:, None] * (self.normal - (y * slope / period)[:, None] * self.along)
+        u = self.amplitude_mm * np.cos(angle)[:, None] * self.direction
+        H = (-self.amplitude_mm * np.sin(angle))[:, None, None] * (self.direction[:, None] * steep[:, None, :])
+        return u, H
+
+    def inverse(self) -> Self:
+        """Return the same star with the opposite sign."""
+        return replace(self, amplitude_mm=-self.amplitude_mm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Bending:
     """Isochoric bending of a block to an arc, in the plane of its length and its thickness.
 

@@ -31,9 +31,8 @@ _COVERED = 2.0  # coverage factor of an expanded uncertainty
 class TissueBasis:
     """Functions on the cells of a tissue, orthonormal by volume: sum over cells of w f_i f_j is 1 for i = j, else 0.
 
-    A coefficient has the unit of the field, the first is its mean (or minus that), and the squares of all add up to its
-    mean square. No error of a field changes a coefficient by more than the root mean square of the error (Cauchy and
-    Schwarz).
+    A coefficient has the unit of the field, the first is its mean, and the squares of all add up to its mean square. No
+    error of a field changes a coefficient by more than the root mean square of the error (Cauchy and Schwarz).
 
     Attributes
     ----------
@@ -95,6 +94,7 @@ class TissueBasis:
 def _orthonormal(columns: FloatArray) -> FloatArray:
     """An orthonormal basis of columns (n, m), without what is shorter than a hundred-thousandth of a unit length."""
     squares, turns = np.linalg.eigh(columns.T @ columns)
+    turns = np.where(columns.sum(axis=0) @ turns < 0.0, -turns, turns)  # so that the first coefficient is the mean
     kept = squares > _DEPENDENT**2
     return np.asarray(columns @ (turns[:, kept] / np.sqrt(squares[kept])))
 
@@ -197,7 +197,7 @@ def decompose(
     References
     ----------
     CWA 16799:2014, Validation of computational solid mechanics models.
-    Christian, Dean, Dvurecenska, Middleton and Patterson, R Soc Open Sci 2021, doi:10.1098/rsos.210916 (functions).
+    Christian and others, R Soc Open Sci 2021 (adaptive geometric moment descriptors: the functions).
     """
     for basis in TissueBasis.rising(cells.points_mm, cells.volumes_ml):
         found = Reconstruction.of(measured, basis, cells)

@@ -80,7 +80,7 @@ def model_form(
 
     References
     ----------
-    Voyles and Roy, AIAA 2015-1374, doi:10.2514/6.2015-1374.
+    Voyles and Roy, 17th AIAA Non-Deterministic Approaches Conference, 2015.
     """
     plus, minus = signed_areas(measured, simulated, volumes_ml)
     weights, factor = volumes_ml / volumes_ml.sum(), safety_factor(samples)

@@ -37,9 +37,10 @@ def coefficients(decompositions: Mapping[str, Decomposition], models: Sequence[s
     for axes, tissue in zip(spots, tissues, strict=True):
         by = decompositions[tissue]
         of_models = {name: found.coefficients for name, found in by.models.items() if name in look}
-        most = 1.05 * max(float(np.abs(of).max()) for of in (by.estimate, *of_models.values())) + by.guide_band
-        line = np.array([-most, most])
-        axes.fill_between(line, line - by.guide_band, line + by.guide_band, color=BAND, linewidth=0, label="2 u(s)")
+        shown = np.concatenate([by.estimate, *of_models.values()])
+        line = np.array([shown.min() - by.guide_band, shown.max() + by.guide_band])
+        edges = line - by.guide_band, line + by.guide_band
+        axes.fill_between(line, *edges, color=BAND, linewidth=0, label="CWA 16799, 2 u(s)")
         axes.plot(line, line, color=INK, linewidth=0.9)
         for name, values in of_models.items():
             colour = look[name].colour

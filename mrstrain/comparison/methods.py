@@ -40,6 +40,10 @@ _PAPERS = {
     "45(1):255-268, 1989. doi:10.2307/2532051",
     "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
     "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
+    "Dvurecenska 2018": "Dvurecenska K, Graham S, Patelli E, Patterson EA. A probabilistic metric for the validation "
+    "of computational models. R Soc Open Sci 5:180687, 2018. doi:10.1098/rsos.180687",
+    "Voyles 2015": "Voyles IT, Roy CJ. Evaluation of model validation techniques in the presence of aleatory and "
+    "epistemic input uncertainties. 17th AIAA Non-Deterministic Approaches Conference, 2015.",
 }
 _IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")  # roles of image files in a record
 _GIVEN = "the displacement was used as given; there is no record of its registration."
@@ -221,7 +225,8 @@ def _compared(cells: int, criteria: Criteria) -> str:
         f"strain-volume curves, for maximum shear strains from {low:g} to {high:g}. Location was compared for tissue "
         f"above {levels}, in clusters of at least {criteria.least_ml:g} mL, by overlap (Dice 1945), distance of the "
         "centroids, and 95th percentile of the Hausdorff distance. Agreement cell by cell was assessed by regression, "
-        "concordance (Lin 1989) and limits of agreement (Bland 1986)."
+        "concordance (Lin 1989) and limits of agreement (Bland 1986). The modified area validation metric "
+        "(Voyles 2015) was computed over all strains, as measured."
     )
 
 
@@ -232,10 +237,15 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
         f"The error bars of {_listed(checked)} were checked by a synthetic warp (the unloaded image warped by the "
         "measured displacement, and registered again), and widened where they were too narrow. "
     )
+    decomposed = (
+        "In each tissue, fields were decomposed into orthonormal polynomials on its cells (CWA 16799:2014), and the "
+        "probability that a model represents the measurement within its uncertainty was computed from the coefficients "
+        "(Dvurecenska 2018). "
+    )
     return (
         f"The 95 % intervals of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed from true "
         "fields drawn with the error model of the registration (bias and spatially correlated noise). "
-        f"{_sources(errors)} {twin or ''}There is no error model of displacement."
+        f"{_sources(errors)} {twin or ''}{decomposed}There is no error model of displacement."
     )
 
 

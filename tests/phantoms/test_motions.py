@@ -8,7 +8,7 @@ import pytest
 from dvc.deformation.protocol import Composed, Motion, RigidMotion
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from phantoms import Bending, ShearWave, compressed, sheared, stretched
+from phantoms import Bending, ShearStar, ShearWave, compressed, sheared, stretched
 
 CENTRE = np.array([3.0, -2.0, 5.0])
 X, Y, Z = np.eye(3)
@@ -20,6 +20,7 @@ MOTIONS: dict[str, Motion] = {
     "compressed": compressed(2, 0.7, CENTRE),
     "sheared": sheared(X, Z, 0.4, CENTRE),
     "wave": ShearWave(TURNED[0], TURNED[1], 12.0, 0.5, 0.3),
+    "star": ShearStar(CENTRE, TURNED[0], TURNED[1], 0.9, 6.0, 30.0, 60.0),
     "bending": Bending(CENTRE, TURNED[2], TURNED[0], 150.0),
     "straightening": Bending(CENTRE, TURNED[2], TURNED[0], 150.0).inverse(),
     "composed": Composed([ShearWave(X, Y, 20.0, 0.3), RigidMotion(TURNED, CENTRE), compressed(0, 1.1, CENTRE)]),
@@ -50,7 +51,7 @@ def test_inverse_leads_back(name: str) -> None:
     np.testing.assert_allclose((np.eye(3) + H_back) @ (np.eye(3) + H), np.tile(np.eye(3), (len(u), 1, 1)), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["compressed", "sheared", "wave", "bending"])
+@pytest.mark.parametrize("name", ["compressed", "sheared", "wave", "star", "bending"])
 def test_volume_is_kept(name: str) -> None:
     _, H = MOTIONS[name].evaluate(POINTS)
     np.testing.assert_allclose(np.linalg.det(np.eye(3) + H), 1.0, atol=1e-12)
@@ -72,6 +73,20 @@ def test_wave_has_the_strain_that_its_peak_says() -> None:
     wave = ShearWave(X, Z, 10.0, 0.6)
     shear = StrainField.from_gradient(wave.evaluate(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.5]]))[1]).max_shear
     np.testing.assert_allclose(shear, [0.6 * np.sqrt(4 + 0.36) / 4, 0.0], atol=1e-12)
+
+
+def test_star_has_its_amplitude_on_the_middle_plane_and_its_strain_a_quarter_of_a_period_beside() -> None:
+    star = ShearStar(np.zeros(3), X, Y, 0.5, 5.0, 45.0, 80.0)
+    s = np.array([-60.0, -40.0, -20.0, 0.0, 40.0, 70.0])
+    middle = s[:, None] * X
+    period = star.period_mm(middle)
+    np.testing.assert_allclose(period, [5.0, 5.0, 15.0, 25.0, 45.0, 45.0])
+    np.testing.assert_allclose(star.displacement(middle), np.tile(0.5 * Z, (6, 1)), atol=1e-12)
+    beside = star.evaluate(middle + 0.25 * period[:, None] * Y)
+    np.testing.assert_allclose(beside[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(beside[1][:, 2, 1], -0.5 * 2.0 * np.pi / period)
+    with pytest.raises(InputError, match="positive periods"):
+        ShearStar(np.zeros(3), X, Y, 0.5, 0.0, 45.0, 80.0)
 
 
 def test_undefined_is_missing_and_never_zero() -> None:

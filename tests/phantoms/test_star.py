@@ -1,0 +1,118 @@
+"""Resolution, noise and efficiency by a star whose response is known: true, filtered, and shifted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from dvc.arrays import FloatArray
+from phantoms import ShearStar, StarPair, efficiencies, resolved_mm, star_pair, star_rows, tissue_block
+
+SMALL = (60, 32, 48)
+
+
+@pytest.fixture(scope="module")
+def pair() -> StarPair:
+    return star_pair(shape=SMALL, spacing_mm=1.6)
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """A star as a Gaussian along its normal shows it: each period is damped by exp(-2 (pi sigma / p)^2)."""
+
+    star: ShearStar
+    sigma_mm: float
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        u, H = self.star.evaluate(points_mm)
+        kept = np.exp(-2.0 * (np.pi * self.sigma_mm / self.star.period_mm(points_mm)) ** 2)
+        return u * kept[:, None], H * kept[:, None, None]
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        return self.evaluate(points_mm)[0]
+
+
+@dataclass(frozen=True)
+class Noisy:
+    """No motion but a shift along z, and white noise of displacement and of its gradient."""
+
+    shift_mm: float
+    sd_mm: float
+    sd_slope: float
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        random, n = np.random.default_rng(1), len(points_mm)
+        u = self.sd_mm * random.standard_normal((n, 3)) + [0.0, 0.0, self.shift_mm]
+        return u, self.sd_slope * random.standard_normal((n, 3, 3))
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        return self.evaluate(points_mm)[0]
+
+
+def test_the_block_is_half_fat_and_half_muscle_with_contrast_and_without_air(pair: StarPair) -> None:
+    names = pair.labels.names
+    tissue = np.vectorize(names.get)(pair.labels.labels)
+    assert set(np.unique(tissue)) == {"fat", "muscle"}
+    z = pair.labels.grid.points()[..., 2]
+    assert (tissue[z < -1.0] == "fat").all()
+    assert (tissue[z > 1.0] == "muscle").all()
+    for name in ("fat", "muscle"):
+        values = pair.reference.values[tissue == name]
+        assert values.std() / values.mean() > 0.05
+    again = star_pair(shape=SMALL, spacing_mm=1.6)
+    assert (again.loaded.values == pair.loaded.values).all()
+    other = tissue_block(2).intensity_at(pair.labels.grid.points().reshape(-1, 3)[:100])
+    assert not np.allclose(other, tissue_block(1).intensity_at(pair.labels.grid.points().reshape(-1, 3)[:100]))
+
+
+def test_the_loaded_image_is_the_unloaded_one_moved_by_the_star() -> None:
+    """Without noise, tissue at X has the signal that it had, at x = X + u; without the motion it has not."""
+    pair = star_pair(shape=(48, 32, 48), spacing_mm=0.8, snr=None)
+    block, points = tissue_block(1), pair.labels.grid.points().reshape(-1, 3)[::7]
+    before = block.intensity_at(points)
+    seen = (pair.loaded.values - pair.repeat.values).reshape(-1)[::7]
+    moved = {sign: block.intensity_at(points - sign * pair.star.displacement(points)) - before for sign in (1.0, -1.0)}
+    agree = {sign: np.corrcoef(seen, of)[0, 1] for sign, of in moved.items()}
+    assert agree[1.0] > 0.35  # bias field and point spread differ
+    assert agree[-1.0] < 0.0
+
+
+def test_a_true_star_is_recovered_whole_and_none_by_one_that_sees_no_motion(pair: StarPair) -> None:
+    for row in star_rows(pair.star, pair):
+        assert (row.displacement, row.strain) == pytest.approx((1.0, 1.0), abs=1e-9)
+    for row in star_rows(Noisy(0.0, 0.0, 0.0), pair):
+        assert (row.displacement, row.strain) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_resolution_is_where_a_filter_of_known_width_leaves_nine_tenths(pair: StarPair) -> None:
+    sigma = 1.5
+    true = np.pi * sigma * np.sqrt(2.0 / -np.log(0.9))  # 20.5 mm
+    found = efficiencies(Filtered(pair.star, sigma), Noisy(0.0, 0.0, 0.0), pair)
+    assert [of.tissue for of in found] == ["fat", "muscle"]
+    for of in found:
+        assert of.displacement_resolution_mm == pytest.approx(true, rel=0.02)
+        assert of.strain_resolution_mm == pytest.approx(true, rel=0.02)
+    wider = efficiencies(Filtered(pair.star, 2.0), Noisy(0.0, 0.0, 0.0), pair)
+    assert wider[0].displacement_resolution_mm == pytest.approx(true * 2.0 / 1.5, rel=0.02)
+    assert np.isnan(efficiencies(Filtered(pair.star, 4.0), Noisy(0.0, 0.0, 0.0), pair)[0].strain_resolution_mm)
+
+
+def test_noise_and_bias_are_those_of_the_pair_without_motion(pair: StarPair) -> None:
+    (fat, _) = efficiencies(Filtered(pair.star, 1.5), Noisy(0.03, 0.05, 0.02), pair)
+    assert fat.displacement_bias_mm == pytest.approx(0.03, abs=0.004)
+    assert fat.displacement_noise_mm == pytest.approx(0.05, rel=0.05)
+    assert fat.strain_bias == pytest.approx(0.0, abs=0.002)
+    assert fat.strain_noise == pytest.approx(0.02 / np.sqrt(2.0), rel=0.05)  # E_dn is half of two slopes
+    assert fat.of_displacement_mm2 == pytest.approx(fat.displacement_noise_mm * fat.displacement_resolution_mm)
+    assert fat.of_strain_mm2 == pytest.approx(fat.strain_noise * fat.strain_resolution_mm**2)
+
+
+def test_the_resolution_is_that_from_which_on_all_is_recovered() -> None:
+    assert resolved_mm([5.0, 10.0, 20.0], [0.2, 0.8, 1.0]) == pytest.approx(15.0)
+    noisy = [0.2, 0.6, 0.88, 0.96, 0.89, 0.97, 1.0]  # noise of a few percent does not make 11 mm of 6
+    assert resolved_mm([5.0, 7.0, 9.0, 11.0, 13.0, 15.0, 17.0], noisy) == pytest.approx(9.8, abs=0.2)
+    assert np.isnan(resolved_mm([5.0, 10.0], [np.nan, 1.0]))
+    assert np.isnan(resolved_mm([5.0, 10.0], [0.95, 0.99]))
+    assert np.isnan(resolved_mm([5.0, 10.0], [0.5, 0.8]))
