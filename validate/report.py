@@ -186,11 +186,13 @@ def _head(one: LoadComparison) -> str:
     return one.load if verdict is None or verdict.level == "trust" else f"{one.load} ({verdict.words.lower()})"
 
 
-def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
-    """Explanation of a comparison, sources of its thresholds, and paragraphs for a methods section if there are any."""
+def closing_sections(
+    thresholds: Sequence[Threshold], methods: Sequence[str], more: Sequence[Section] = ()
+) -> list[Section]:
+    """Explanation of a comparison, sources of its thresholds, ``more``, and a methods text if there are paragraphs."""
     rows = tuple((t.max_shear, t.source) for t in thresholds)
     sources = Section("Strain thresholds", None, (Table("Thresholds", ("maximum shear strain", "source"), rows),))
-    return [_CLOSING, sources, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
+    return [_CLOSING, sources, *more, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
 
 
 def shown(area: Area) -> str:

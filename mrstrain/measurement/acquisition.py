@@ -193,7 +193,7 @@ def _together(values: Mapping[str, str | float | None]) -> str:
 
 def _text(value: object) -> str:
     if isinstance(value, float):
-        return f"{value:.4g}" if np.isfinite(value) else NOT_GIVEN
+        return f"{value:.3g}" if np.isfinite(value) else NOT_GIVEN
     return NOT_GIVEN if value is None or value == "" else shown(value if isinstance(value, str | int) else str(value))
 
 
