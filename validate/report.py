@@ -41,10 +41,10 @@ _CLOSING = Section(
         "information on location: two fields may have the same curve and differ everywhere. Overlap (Dice), distances "
         "of centroids, the Hausdorff distance (95th percentile) and the agreement cell by cell show where the fields "
         "differ.",
-        "Intervals and the grey band come from the error model of the registration: true fields that are consistent "
-        "with the measured one are drawn, and the model's area to each is computed. If an interval excludes the area "
-        "as measured, noise and smoothing have shifted the measured curve. Two models differ significantly if the same "
-        "one has the smaller area in 97.5 % of the draws, widened like the intervals.",
+        "Intervals and the grey band have 95 % coverage. They come from the error model of the registration: true "
+        "fields that are consistent with the measured one are drawn, and the model's area to each is computed. If an "
+        "interval excludes the area as measured, noise and smoothing have shifted the measured curve. Two models "
+        "differ significantly if the same one has the smaller area in 97.5 % of the draws, widened like the intervals.",
         "A measurement without a label map smooths strain discontinuities at tissue interfaces over about 4 mm, and "
         "noise increases small shear strains; a model does neither. A comparison cannot show effects that the "
         "measurement cannot detect: scanner distortion, creep during a scan, and tissue that slides along a smooth "

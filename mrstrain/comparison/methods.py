@@ -235,8 +235,8 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
         "measured displacement, and registered again), and widened where they were too narrow. "
     )
     return (
-        f"The 95 % intervals of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed from true "
-        "fields drawn with the error model of the registration (bias and spatially correlated noise). "
+        f"The intervals (95 % coverage) of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed "
+        "from true fields drawn with the error model of the registration (bias and spatially correlated noise). "
         f"{_sources(errors)} {twin or ''}There is no error model of displacement."
     )
 

@@ -8,7 +8,7 @@ from dvc.errors import InputError
 from dvc.report.page import Section, Table
 from validate import NOTHING, Comparison
 
-_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration, with the 95 % confidence interval in brackets."
+_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration, with its interval of 95 % coverage in brackets."
 _NEAREST = (
     " Best match: smallest area between the strain-volume curves of model and measurement in that tissue. A dash: no "
     "model is better than zero strain everywhere."
