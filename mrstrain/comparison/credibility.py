@@ -18,6 +18,7 @@ import numpy as np
 
 from dvc import Verdict
 from dvc.report.page import Section, Table
+from fe import Tolerance
 from mrstrain.comparison.model_facts import ModelFacts, facts_of, used_for_calibration
 from mrstrain.measurement.acquisition import NOT_GIVEN
 from mrstrain.options.credibility import CredibilityOptions
@@ -173,7 +174,8 @@ def _solved(held: Holdings) -> str:
         return ""
     short = ", ".join(f"{model} {load} {part:.0%}" for model, load, part in loads if part < 1.0)
     reached = f"reached in part: {short}" if short else f"all {len(loads)} loads reached"
-    return f"Residual forces at most 0.01 % of the plate's at each converged increment; {reached}"
+    force = f"{100.0 * Tolerance().force:g} % of those on the plate and the fixed nodes"
+    return f"Residual forces at each converged increment: at most {force}; {reached}"
 
 
 def _inputs_sure(held: Holdings) -> str:
