@@ -78,7 +78,7 @@ def acquisition_section(folders: Mapping[str, Path], given: AcquisitionOptions |
 def acquisition_sentence(folders: Mapping[str, Path], given: AcquisitionOptions | None = None) -> str:
     """A paragraph of a methods section on the acquisition; empty if neither a header nor a person tells of it."""
     known = _Known.read(folders, given)
-    told = {name: known.parameter(name)[0] for name in _PARAMETERS}
+    told = {name: known.in_a_sentence(name) for name in _PARAMETERS}
     if all(value == NOT_GIVEN for value in told.values()):
         return ""
 
@@ -131,9 +131,24 @@ class _Known:
         of_header, by_person = self.images(lambda scan: scan.get(name)), _text(getattr(self.given, name))
         if of_header == NOT_GIVEN:
             return by_person, "" if by_person == NOT_GIVEN else "study file"
-        if by_person not in (NOT_GIVEN, of_header):
+        if by_person not in (NOT_GIVEN, *self._told_by_headers(name)):
             return f"{of_header} (study file: {by_person})", "header"
         return of_header, "header"
+
+    def in_a_sentence(self, name: str) -> str:
+        """A parameter as the headers that have it tell it, or else as the person does."""
+        values = self._told_by_headers(name)
+        if len(values) < 2:
+            return next(iter(values), _text(getattr(self.given, name)))
+        return " and ".join(f"{value} ({', '.join(of)})" for value, of in values.items())
+
+    def _told_by_headers(self, name: str) -> dict[str, list[str]]:
+        """The values that headers tell, each with its images."""
+        values: dict[str, list[str]] = {}
+        for image, scan in self.scans.items():
+            if (value := _text(scan.get(name))) != NOT_GIVEN:
+                values.setdefault(value, []).append(image)
+        return values
 
     def rows(self) -> Iterable[_Row]:
         for name, words in _PARAMETERS.items():

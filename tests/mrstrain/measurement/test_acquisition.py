@@ -91,6 +91,18 @@ def test_the_methods_text_has_what_is_known_and_says_what_is_not(tmp_path: Path)
     )
 
 
+def test_a_sentence_takes_the_headers_that_tell_and_names_images_only_where_they_differ(tmp_path: Path) -> None:
+    silent = folder_of(tmp_path, "Load1", more=dict.fromkeys(HEADER))
+    rows = rows_of({"Load1": silent}, repetition_time_ms=8.2)
+    assert rows["Repetition time (TR), ms"] == ("8.2 (unloaded image); not given (Load1)", "header")
+    assert acquisition_sentence({"Load1": silent}).startswith(
+        "Images were acquired at 3 T (Siemens), TR 8.2 ms, voxels"
+    )
+    other = folder_of(tmp_path, "Load2", more={"field_strength_t": 1.5})
+    told = acquisition_sentence({"Load1": silent, "Load2": other})
+    assert told.startswith("Images were acquired at 3 (unloaded image) and 1.5 (Load2) T (Siemens), TR 8.2 ms")
+
+
 @pytest.mark.parametrize("content", ["{", "[]", '{"parameters": {"scans": 3}, "noise": []}', '{"parameters": null}'])
 def test_records_that_tell_nothing_make_no_section_and_no_sentence(tmp_path: Path, content: str) -> None:
     for name in ("provenance.json", "quality.json"):
