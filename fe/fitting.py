@@ -1,4 +1,4 @@
-"""Stretch-stress curves of mechanical tests, and model parameters fitted to them, with confidence intervals."""
+"""Stretch-stress curves of mechanical tests, and model parameters fitted to them, with intervals of 95 % coverage."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -94,7 +94,7 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A fitted parameter and its 95 % confidence interval."""
+    """A fitted parameter and its 95 % interval."""
 
     name: str
     value: float
@@ -280,7 +280,7 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
 def _with_intervals(
     law: _Law, best: OptimizeResult, deviations: FloatArray, curves: Sequence[Curve], stress: FloatArray
 ) -> tuple[FloatArray, tuple[Parameter, ...]]:
-    """The best values, with the first kept positive if required, and their 95 % confidence intervals."""
+    """The best values, with the first kept positive if required, and their 95 % intervals."""
     values, least = best.x, np.full(len(best.x), -np.inf)
     freedom = len(stress) - len(values)
     widths = student.ppf(0.975, freedom) * deviations

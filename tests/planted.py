@@ -6,6 +6,7 @@ import base64
 import binascii
 import gzip
 import io
+import json
 import re
 import zipfile
 import zlib
@@ -37,6 +38,14 @@ def plant_in_nifti(path: Path) -> None:
     image.header["aux_file"] = PLACE.encode()
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", f"{NAME} {BORN} {PLACE}".encode()))
     nibabel.save(image, path)
+
+
+def plant_beside(path: Path) -> None:
+    """Write the names into a JSON file of dcm2niix beside a NIfTI file, with a number and a code that may be told."""
+    told = {"PatientName": NAME, "PatientID": NUMBER, "PatientBirthDate": BORN, "InstitutionName": PLACE}
+    told |= {"Manufacturer": NAME, "ManufacturersModelName": NUMBER, "SequenceName": PLACE, "AcquisitionDate": DATE}
+    scan = {"MagneticFieldStrength": 3, "ScanningSequence": "GR", "RepetitionTime": NUMBER, "EchoTime": DATE}
+    path.with_name(path.name.removesuffix(".nii.gz") + ".json").write_text(json.dumps(told | scan))
 
 
 def plant_in_nrrd(path: Path) -> None:
@@ -87,6 +96,7 @@ def _geometry(image: Image) -> tuple[dict[str, Any], dict[str, str], list[dict[s
         "ImageOrientationPatient": [f"{v:.8f}" for v in (*axes[:, 0], *axes[:, 1])],
         "PixelSpacing": [f"{grid.spacing_mm[1]:.6g}", f"{grid.spacing_mm[0]:.6g}"], "Columns": grid.shape[0],
         "Rows": grid.shape[1], "PatientName": NAME, "PatientID": NUMBER, "InstitutionName": PLACE,
+        "Manufacturer": f"SIEMENS {NAME}", "ManufacturerModelName": NAME, "SequenceName": NAME, "FlipAngle": "12",
         "PatientBirthDate": DATE, "StudyDate": DATE, "SeriesDescription": NAME, "ReferringPhysicianName": NAME,
     }  # fmt: skip
     places = np.asarray(grid.origin_mm) + np.arange(grid.shape[2])[:, None] * axes[:, 2] * grid.spacing_mm[2]

@@ -17,11 +17,21 @@ QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"")  # names as they were, in the changel
 NOT_FOR_USERS = {"decisions", "api"}  # a record of its time; made from docstrings
 
 
+def entries() -> list[dict[str, str]]:
+    """The rows of the glossary's tables by their columns; the last of each table is "not"."""
+    rows, columns = [], []
+    for line in GLOSSARY.read_text().splitlines():
+        cells = [cell.strip() for cell in line.removeprefix("|").removesuffix("|").split("|")]
+        if cells[0] == "term":
+            columns = cells
+        elif line.startswith("|") and cells[0].strip("-"):
+            rows.append(dict(zip(columns, cells, strict=True)))
+    return rows
+
+
 def forbidden() -> list[str]:
-    """The expressions of the last column of the glossary's tables."""
-    rows = [line.strip("| \n").split("|") for line in GLOSSARY.read_text().splitlines() if line.startswith("|")]
-    lines = [row[-1].strip() for row in rows if len(row) == 3 and row[0].strip() != "term"]
-    return [words.strip() for line in lines for words in line.split(",") if words.strip(" -")]
+    """The expressions of the column "not" of the glossary's tables."""
+    return [words.strip() for row in entries() for words in row["not"].split(",") if words.strip()]
 
 
 @cache
@@ -55,8 +65,29 @@ def found(words: str, texts: Iterable[tuple[str, str]]) -> list[str]:
 
 def test_the_glossary_has_its_forbidden_twins() -> None:
     assert {"shading", "told apart", "maximal shear"} <= set(forbidden())
+    assert {"confidence interval", "how accurate", "how sure", "error margin"} <= set(forbidden())
     assert found("told apart", [("here", "A is told\n    apart from B")]) == ["here: 'told\\n    apart'"]
     assert not found("travel", [("here", "travelling")])
+
+
+def test_terms_of_measurement_quality_are_those_of_the_vim_and_say_where_they_are_used() -> None:
+    of_vim = {row["term"]: row for row in entries() if "VIM" in row}
+    numbers = {
+        "measurand": "2.3", "accuracy": "2.13", "trueness": "2.14", "precision": "2.15", "measurement error": "2.16",
+        "bias": "2.18", "repeatability": "2.21", "reproducibility": "2.25", "measurement uncertainty": "2.26",
+        "standard uncertainty": "2.30", "expanded uncertainty": "2.35", "coverage interval": "2.36", "coverage": "2.37",
+        "calibration": "2.39", "resolution": "4.14",
+    }  # fmt: skip
+    assert {term: row["VIM"] for term, row in of_vim.items()} == numbers
+    assert "k = 2" in of_vim["expanded uncertainty"]["meaning"]
+    for term, row in of_vim.items():
+        assert len(row["meaning"]) > 20, term
+        assert len(row["in mrstrain"]) > 20, term
+
+
+@pytest.mark.parametrize("place", ["mrstrain/studies/answer.py", "dvc/measurement/page.py", "validate/report.py"])
+def test_reports_say_what_their_intervals_are(place: str) -> None:
+    assert "95 % coverage" in (ROOT / place).read_text()
 
 
 @pytest.mark.parametrize("words", forbidden())

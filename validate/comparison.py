@@ -150,7 +150,7 @@ class Comparison:
 
     def write(
         self, folder: Path | str, *, record: Mapping[str, object] | None = None, methods: Sequence[str] = (),
-        on_image: bool = False, each: Each = map,
+        more: Sequence[Section] = (), on_image: bool = False, each: Each = map,
     ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:  # fmt: skip
         """Write tables, fields, figures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
@@ -164,6 +164,8 @@ class Comparison:
             Provenance for the JSON files; by default the range of strain.
         methods : sequence of str
             Paragraphs for a methods section.
+        more : sequence of Section
+            Further closing sections of the report, before the methods text.
         on_image : bool
             Also write each model's displacement and maximum shear strain on the voxels of the label map.
         each : callable
@@ -205,7 +207,7 @@ class Comparison:
             "verdict_by_load": {load: _plain(verdict) for load, verdict in self.verdicts.items()},
         }  # fmt: skip
         write_json(target / tables.RECORD, own | about)
-        closing, title = closing_sections(self.loads[0].criteria.thresholds, methods), "Models and measurement"
+        closing, title = closing_sections(self.loads[0].criteria.thresholds, methods, more), "Models and measurement"
         write_report(target / "report.html", title, self.verdict, sections, closing, record_lines(about))
         return tuple(sections), tuple(closing)
 

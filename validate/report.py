@@ -43,10 +43,10 @@ _CLOSING = Section(
         "information on location: two fields may have the same curve and differ everywhere. Overlap (Dice), distances "
         "of centroids, the Hausdorff distance (95th percentile) and the agreement cell by cell show where the fields "
         "differ.",
-        "Intervals and the grey band come from the error model of the registration: true fields that are consistent "
-        "with the measured one are drawn, and the model's area to each is computed. If an interval excludes the area "
-        "as measured, noise and smoothing have shifted the measured curve. Two models differ significantly if the same "
-        "one has the smaller area in 97.5 % of the draws, widened like the intervals.",
+        "Intervals and the grey band have 95 % coverage. They come from the error model of the registration: true "
+        "fields that are consistent with the measured one are drawn, and the model's area to each is computed. If an "
+        "interval excludes the area as measured, noise and smoothing have shifted the measured curve. Two models "
+        "differ significantly if the same one has the smaller area in 97.5 % of the draws, widened like the intervals.",
         "A measurement without a label map smooths strain discontinuities at tissue interfaces over about 4 mm, and "
         "noise increases small shear strains; a model does neither. A comparison cannot show effects that the "
         "measurement cannot detect: scanner distortion, creep during a scan, and tissue that slides along a smooth "
@@ -188,11 +188,13 @@ def _head(one: LoadComparison) -> str:
     return one.load if verdict is None or verdict.level == "trust" else f"{one.load} ({verdict.words.lower()})"
 
 
-def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
-    """Explanation of a comparison, sources of its thresholds, and paragraphs for a methods section if there are any."""
+def closing_sections(
+    thresholds: Sequence[Threshold], methods: Sequence[str], more: Sequence[Section] = ()
+) -> list[Section]:
+    """Explanation of a comparison, sources of its thresholds, ``more``, and a methods text if there are paragraphs."""
     rows = tuple((t.max_shear, t.source) for t in thresholds)
     sources = Section("Strain thresholds", None, (Table("Thresholds", ("maximum shear strain", "source"), rows),))
-    return [_CLOSING, sources, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
+    return [_CLOSING, sources, *more, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
 
 
 def shown(area: Area) -> str:

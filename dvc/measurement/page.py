@@ -68,7 +68,7 @@ def drawings_of(
     drawn["jacobian"] = Drawing.of("Volume ratio", figures.jacobian_slices, view, reference, maps.jacobian)
     if sigma is not None:
         spread = view, reference, sigma, SIGMA_SCALE
-        drawn["sigma"] = Drawing.of("Uncertainty of the maximum shear strain", figures.sigma_slices, *spread)
+        drawn["sigma"] = Drawing.of("Standard uncertainty of the maximum shear strain", figures.sigma_slices, *spread)
     return drawn
 
 
@@ -162,7 +162,7 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
         for r in regions
         if r.quantity == "max_shear"
     )
-    note = "In brackets: 95 % interval, from the error model." if known else ""
+    note = "In brackets: interval of 95 % coverage, from the error model." if known else ""
     return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 
 

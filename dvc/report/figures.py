@@ -28,7 +28,7 @@ from dvc.report.style import BAND, BOLD, ON_DARK, TISSUES, looks
 from dvc.trust.regions import volume_above
 
 MAX_SHEAR = "maximum shear strain (E₁ − E₃)/2, no unit"
-SIGMA = "standard deviation of the maximum shear strain, no unit"
+SIGMA = "standard uncertainty of the maximum shear strain, no unit"
 _DISPLACEMENT = "length of the displacement relative to the bone, mm"
 _COLOURS = {  # what is drawn with its unit, and the name of its colour map
     "max_shear": (MAX_SHEAR, "viridis"), "sigma": (SIGMA, "cividis"), "displacement_mm": (_DISPLACEMENT, "viridis"),
@@ -105,7 +105,7 @@ def image_slices(view: View, image: Image) -> Figure:
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> Figure:
-    """Standard deviation of the maximum shear strain in colour over the unloaded image, from the error model.
+    """Standard uncertainty of the maximum shear strain in colour over the unloaded image, from the error model.
 
     Grey: bone, or no result.
     """

@@ -1,4 +1,4 @@
-"""The commands that measure strain, and those that measure how accurately: phantoms, synthetic warps, their study."""
+"""The commands that measure strain, and those that measure its error: phantoms, synthetic warps, their study."""
 
 from functools import partial
 from pathlib import Path

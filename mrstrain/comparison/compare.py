@@ -17,6 +17,7 @@ from dvc.report.page import Section
 from dvc.threads import usable_cores
 from dvc.worker import side_by_side
 from fe import read_tet_mesh
+from mrstrain.comparison.credibility import Holdings, credibility_section
 from mrstrain.comparison.from_record import fill_directions, fill_labels, taken_from_record
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, model_files
@@ -136,7 +137,10 @@ def compare(
                 each=each,
             )  # fmt: skip
             said = methods(folders, of_models, result, criteria)
-            parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
+            held = [credibility_section(Holdings.of(result, {name: path.parent for name, path in of_models.items()}))]
+            parts = result.write(
+                target, record=record, methods=said, more=held, on_image=comparison.on_image, each=each
+            )
     share(1.0)
     return Compared(target, result, *parts, taken)
 

@@ -56,7 +56,9 @@ def drive(
     target, place, tell = Path(out), Path(mesh), progress or (lambda *_: None)
     unit, frame, sets = coordinates.mesh_unit, coordinates.mesh_frame, material.sets
     read = fe.read_tet_mesh(place, unit=unit, frame=frame)
-    laws = {one.name: one.for_regions(read.regions) for one in material_sets(sets)}
+    chosen = material_sets(sets)
+    laws = {one.name: one.for_regions(read.regions) for one in chosen}
+    titles = {one.name: one.title for one in chosen}
     for materials, _ in laws.values():
         fe.check_materials(read, materials)
     measurements = result_folders(Path(dvc), loads)
@@ -90,7 +92,7 @@ def drive(
             complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
             lines += messages
             about = {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name}
-            about |= {"laws": {region: law.description for region, law in materials.items()}}
+            about |= {"laws": {region: law.description for region, law in materials.items()}, "title": titles[name]}
             write_json(folders[name] / "simulation.json", about | record)
     tell("drive", "simulating", 1.0)
     return Outcome(target, (*lines, f"Results: {target}"), complete)

@@ -6,11 +6,11 @@ from typing import Any
 
 from dvc.io.images.read import format_of
 from dvc.io.result_folder import PROVENANCE, QUALITY
-from dvc.own_files import read_json
 from dvc.registration.engines import methods_of
 from dvc.report.page import NIIVUE
 from fe import LoadStep
-from mrstrain.records.provenance import versions
+from mrstrain.measurement.acquisition import acquisition_sentence
+from mrstrain.records.provenance import read_record, versions
 from validate import Comparison, Criteria
 from validate.curves import DRAWS
 from validate.location import LOCATION_DRAWS
@@ -63,25 +63,27 @@ def methods(
     compared = _compared(len(comparison.loads[0].fields.points_mm), criteria)
     uncertainty = [_uncertainty(measured)] if any(one.bands for one in comparison.loads) else []
     viewer = f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue)."
-    return _with_references([_measured(measured), *_simulated(models, measured), compared, *uncertainty, viewer])
+    acquired = _acquired(measured)
+    return _with_references(
+        [*acquired, _measured(measured), *_simulated(models, measured), compared, *uncertainty, viewer]
+    )
 
 
 def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
     """Paragraphs on the measurement alone, with the references last; ``measured`` as in `methods`."""
     known = _sources(_errors(measured))
-    return _with_references([_measured(measured), *([f"Error of the maximum shear strain: {known}"] if known else [])])
+    error = [f"Error of the maximum shear strain: {known}"] if known else []
+    return _with_references([*_acquired(measured), _measured(measured), *error])
+
+
+def _acquired(measured: Mapping[str, Path]) -> list[str]:
+    """How the images were acquired, if their headers tell."""
+    return [told] if (told := acquisition_sentence(measured)) else []
 
 
 def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
     used = [paper for name, paper in _PAPERS.items() if any(name in part for part in parts)]
     return (*parts, *(("References", *used) if used else ()))
-
-
-def _record(place: Path) -> Record:
-    try:
-        return read_json(place)
-    except (OSError, ValueError):
-        return {}
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -92,7 +94,7 @@ def _measured(measured: Mapping[str, Path]) -> str:
     """How the displacement was measured; loads that were registered in the same way share a sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
-        record = _record(folder / PROVENANCE)
+        record = read_record(folder / PROVENANCE)
         groups.setdefault(_registration(record) + _files(record), []).append(load)
     sentences = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
@@ -147,13 +149,13 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
     sets, driven, others, used = list[str](), list[str](), list[str](), set[str]()
     solvers, levelled = dict[str, list[str]](), dict[str, list[str]]()
     for name, path in models.items():
-        record = _record(path.parent / "simulation.json")
+        record = read_record(path.parent / "simulation.json")
         command, given = record.get("command"), record.get("parameters", {})
         if command == "drive":
             laws = "; ".join(f"{region}: {law}" for region, law in record["laws"].items())
             driven.append(f"{name}: with mrstrain {record.get('versions', {}).get('mrstrain', '?')} ({laws}).")
             used.add(record["set"])
-        elif _record(path.parent / PROVENANCE).get("command") == "level":
+        elif read_record(path.parent / PROVENANCE).get("command") == "level":
             levelled.setdefault(_levelled(path, measured), []).append(name)
         elif command == "simulate" and "set" in given:
             laws = "; ".join(f"{region}: {law['law']}" for region, law in given["laws"].items())
@@ -181,8 +183,8 @@ _DRIVEN = (
 def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
     """How the measurement was simulated for a model."""
     work = path.parent.with_name(path.parent.name + "-work") / "registered" / path.stem / path.stem
-    how = _registration(_record(work / PROVENANCE))
-    same = how in {_registration(_record(folder / PROVENANCE)) for folder in measured.values()}
+    how = _registration(read_record(work / PROVENANCE))
+    same = how in {_registration(read_record(folder / PROVENANCE)) for folder in measured.values()}
     return (
         "forward-model comparison: the unloaded image was denoised and warped by the displacement of the model, new "
         "noise and a new bias field were added, and the pair was registered"
@@ -243,8 +245,8 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
         "(Dvurecenska 2018). "
     )
     return (
-        f"The 95 % intervals of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed from true "
-        "fields drawn with the error model of the registration (bias and spatially correlated noise). "
+        f"The intervals (95 % coverage) of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed "
+        "from true fields drawn with the error model of the registration (bias and spatially correlated noise). "
         f"{_sources(errors)} {twin or ''}{decomposed}There is no error model of displacement."
     )
 
@@ -256,4 +258,4 @@ def _sources(errors: Mapping[str, Record]) -> str:
 
 def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
     """The record on the error of the maximum shear strain, for each registration."""
-    return {load: _record(folder / QUALITY).get("error_of_max_shear", {}) for load, folder in measured.items()}
+    return {load: read_record(folder / QUALITY).get("error_of_max_shear", {}) for load, folder in measured.items()}

@@ -11,6 +11,7 @@ from dvc.atomic_files import write_json
 from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.report.page import Section, record_lines, write_report
 from dvc.trust.verdict import worst
+from mrstrain.measurement.acquisition import acquisition_section
 
 if TYPE_CHECKING:  # it draws, and matplotlib takes half a second: `Plan.register` loads it meanwhile
     from dvc import Measurement
@@ -104,6 +105,8 @@ class Series:
         write_json(out / PROVENANCE, record)
         told = [*first, *(replace(section, folded=bool(first)) for section in told)]
         told += [replace(section, folded=True) for section in more]
+        acquired = acquisition_section({case.name: case.folder for case in cases})
+        told += [] if acquired is None else [acquired]
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
         title, about = "Strain from MR image pairs", _images(record, cases)
         write_report(out / REPORT, title, verdict, told, closing, record_lines(record), notes=about)

@@ -15,6 +15,7 @@ from dvc.measurement.error_bars import TwinCheck
 from dvc.measurement.judgement import maps_of
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker
+from mrstrain.measurement.acquisition import noise_record
 from mrstrain.measurement.case import Case
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 from mrstrain.records.provenance import provenance
@@ -61,7 +62,7 @@ class Plan:
         measured = dvc.Measurement.from_registration(
             found, self.subject, evidence, name=folder.name, is_repeat=is_repeat
         )
-        return Case.of(measured, folder, self.record), measured.quality.noise_floor
+        return Case.of(measured, folder, {**self.record, **noise_record(measured)}), measured.quality.noise_floor
 
 
 def record_of(

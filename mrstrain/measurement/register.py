@@ -20,6 +20,7 @@ from dvc.report.page import Section
 from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
+from mrstrain.measurement.acquisition import scans_record
 from mrstrain.measurement.answer import measured_strain
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
@@ -130,6 +131,8 @@ def register(
         more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
         more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
         more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}
+        scans_of = {name: (place, images[name]) for name, place in places.items()}
+        more |= scans_record((load0, subject.reference), scans_of)
         record = record_of(subject, files, settings, registration, more)
         plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
         run = _Run(target, plan, images, start, tell)
@@ -204,8 +207,9 @@ def register_one(
         model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
         floor = None if series.repeat is None else read_noise_floor(series.repeat / QUALITY)
         start = None if series.after is None else spline_in(series.after)
-        more = {"allow_missing": missing, "bone_label": subject_files.bone_label}
+        more: dict[str, object] = {"allow_missing": missing, "bone_label": subject_files.bone_label}
         more["shear_direction_lps"] = onto.plain()["shear_direction"]
+        more |= scans_record((load0, subject.reference), {out.name: (load, loaded)})
         chained = how.model_copy(update={"chain": series.after is not None})
         record = record_of(subject, {"loads": [load]}, settings, chained, more)
         plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, how.twin)

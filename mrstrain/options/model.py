@@ -43,6 +43,8 @@ Count = Annotated[int, _of_numpy(numbers.Integral, int), Strict(), Field(ge=1)]
 Flag = Annotated[bool, Strict()]
 Vector = Annotated[tuple[Real, Real, Real], BeforeValidator(lambda v: v.tolist() if hasattr(v, "tolist") else v)]
 Text = Annotated[str, BeforeValidator(lambda v: fspath(v) if isinstance(v, PathLike) else v)]
+Said = Annotated[str | None, AfterValidator(lambda v: (v or "").strip() or None)]
+"""What a person says in free words; None if they are empty."""
 Names = Annotated[tuple[Text, ...], AfterValidator(_once)]
 
 _M = TypeVar("_M", bound="Options")

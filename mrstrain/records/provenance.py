@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from dvc.own_files import read_json
 from dvc.software import distribution_versions
 from dvc.threads import usable_cores
 from mrstrain.records.doctor import usable_memory_bytes
@@ -84,6 +85,14 @@ def provenance(
         "machine": {"processor": _processor(), "cores": usable_cores(), "memory_gib": gib}, "inputs": files,
         "parameters": dict(parameters),
     }  # fmt: skip
+
+
+def read_record(place: Path) -> Mapping[str, Any]:
+    """A record of provenance or of quality; an empty one where there is none, or none that can be read."""
+    try:
+        return read_json(place)
+    except (OSError, ValueError):
+        return {}
 
 
 def without_folders(value: Any, home: Path) -> Any:

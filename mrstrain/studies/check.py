@@ -11,6 +11,7 @@ import numpy as np
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
 from dvc.errors import MrstrainError
 from dvc.io.images.labels import read_names
+from dvc.io.images.scan_parameters import read_scan_parameters
 from dvc.io.result_folder import REPEAT
 from dvc.labelling.boundaries import correctable
 from dvc.labelling.tissues import NAMES
@@ -20,6 +21,7 @@ from dvc.trust.error_model import error_model_of
 from fe import BONE, MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
+from mrstrain.options.acquisition import AcquisitionOptions
 from mrstrain.options.modelling import ModelReading
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
@@ -66,6 +68,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     looked.at_loaded(reference)
     if labels is not None and told.models.results:
         looked.tried(looked.at_results, labels)
+    looked.at_what_a_person_tells()
     planned = looked.tried(plan, told)
     if planned is not None and not looked.wrong:
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
@@ -311,6 +314,16 @@ class _Look:
                 "[models] fixed: 'cut' (the truncation surface) can only be detected if a tissue of the label map is "
                 "named skin."
             )
+
+    def at_what_a_person_tells(self) -> None:
+        """Note what of the acquisition and of the credibility is not given; nothing of it is required."""
+        place = self.study.path(self.study.images.load0)
+        told = read_scan_parameters(place).known() | self.study.acquisition.model_dump(exclude_none=True)
+        lacking = {
+            "acquisition": [name for name in AcquisitionOptions.model_fields if name not in told],
+            "credibility": self.study.credibility.lacking,
+        }
+        self.notes += [f"Not given in [{table}]: {', '.join(names)}" for table, names in lacking.items() if names]
 
     def at_results(self, labels: LabelMap) -> None:
         """Read every result of another code."""

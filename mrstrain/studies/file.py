@@ -14,6 +14,8 @@ from dvc.errors import InputError
 from dvc.file_names import as_file_name, clash, one_spelling
 from dvc.io.result_folder import REPEAT
 from mrstrain.options import modelling
+from mrstrain.options.acquisition import AcquisitionOptions
+from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.options.measurement import AUTO, Frame, RegistrationOptions, SubjectFiles, Unit, command_parts
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
 from mrstrain.records.inputs import made_labels
@@ -170,6 +172,8 @@ class Study(_Part):
     mesh: Mesh = Mesh()
     models: Models = Models()
     compare: modelling.ComparisonOptions = modelling.ComparisonOptions()
+    acquisition: AcquisitionOptions = AcquisitionOptions()
+    credibility: CredibilityOptions = CredibilityOptions()
     _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
 
     def at(self, table: str, key: str) -> str:

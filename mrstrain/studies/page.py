@@ -12,17 +12,21 @@ from dvc.measurement.page import STRAIN
 from dvc.measurement.side_by_side import FIGURE, measured_by_load
 from dvc.report.page import METHODS, Picture, Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
+from mrstrain.comparison.credibility import TITLE as CREDIBILITY
 from mrstrain.comparison.methods import methods_of_registrations
+from mrstrain.measurement.acquisition import ACQUIRED, acquisition_section, acquisition_sentence
 from mrstrain.options.measurement import MeshAndAxes
 from mrstrain.options.modelling import Directions
 from mrstrain.records.inputs import read_subject
 from mrstrain.records.provenance import provenance, without_folders
 from mrstrain.studies.answer import answer_of
+from mrstrain.studies.credibility import study_credibility
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome, left_out_of
 from mrstrain.studies.plan import COMPARISON, REGISTRATION
 from mrstrain.studies.true_error import error_against_truth
 
+_BY_A_PERSON = {"acquisition", "credibility"}  # tables of the study file with free text
 _RELOAD_S = 10  # a browser shows the page anew, while a study runs
 
 
@@ -34,10 +38,13 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     labelled = [section for one in _of_kind(outcomes, "label") for section in one.result.sections]
     closing = [section for one in outcomes.values() for section in one.result.closing]
     if not closing and registered:  # a study without a comparison gets the methods text of the measurement
-        measured = [load for load in study.loads if outcomes[f"register {load}"].record is not None]
-        folders = {load: study.out / REGISTRATION / load for load in measured}
+        folders = _folders(study, outcomes)
         closing = [Section(METHODS, paragraphs=methods_of_registrations(folders) if folders else ())]
-    record = provenance("run", {}, without_folders(study.model_dump(mode="json", exclude={"place"}), study.place))
+    acquired = acquisition_sentence(_folders(study, outcomes), study.acquisition)
+    closing = [_with_acquisition(one, acquired) for one in closing if one.title != CREDIBILITY]
+    said = study.model_dump(mode="json", include=_BY_A_PERSON)  # free text, which is no path
+    files_of = study.model_dump(mode="json", exclude={"place", *_BY_A_PERSON})
+    record = provenance("run", {}, without_folders(files_of, study.place) | said)
     records = {name: outcome.record for name, outcome in outcomes.items() if outcome.record is not None}
     # input files of the results, each once, with their hashes at that time
     files = dict.fromkeys((name, sha) for one in records.values() for name, sha in one.made_from.get("files", []))
@@ -48,12 +55,29 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     of_each = [section for of in of_loads.values() for section in of.sections if section.title in study.loads]
     pictures = [] if compared else _side_by_side(study, outcomes)
     answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures)
-    others = [*against_truth, *compared[1:], *registered, *labelled, _stages(outcomes)]
+    scans = acquisition_section(_folders(study, outcomes), study.acquisition)
+    acquisition = [] if scans is None else [scans]
+    credibility = study_credibility(study, outcomes)
+    others = [*against_truth, *compared[1:], *registered, *labelled, *acquisition, *credibility, _stages(outcomes)]
     sections = [*answer, *(replace(section, folded=True) for section in others)]
     verdict = _verdict(
         [s.verdict.among(s.title) for of in of_loads.values() for s in of.sections if s.verdict], compared
     )
     write_report(path, study.study.name, verdict, sections, closing, record_lines(record), notes=_incomplete(outcomes))
+
+
+def _folders(study: Study, outcomes: Mapping[str, StageOutcome]) -> dict[str, Path]:
+    """Folder of each load that was measured."""
+    measured = [load for load in study.loads if outcomes[f"register {load}"].record is not None]
+    return {load: study.out / REGISTRATION / load for load in measured}
+
+
+def _with_acquisition(section: Section, acquired: str) -> Section:
+    """A methods text with this paragraph on the acquisition, which knows the study file, in place of its own."""
+    if section.title != METHODS:
+        return section
+    others = tuple(one for one in section.paragraphs if not one.startswith(ACQUIRED))
+    return replace(section, paragraphs=(acquired, *others) if acquired and others else others)
 
 
 def write_page_in_progress(

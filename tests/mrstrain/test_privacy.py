@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import re
 import shutil
 import zlib
 from dataclasses import replace
@@ -22,6 +23,7 @@ from tests.planted import (
     NUMBER,
     PLACE,
     PLANTED,
+    plant_beside,
     plant_in_nifti,
     plant_in_nrrd,
     planted_in,
@@ -48,6 +50,7 @@ def inputs(made_once, tiny_pair) -> Path:
             plant_in_nrrd(folder / name)
         for name in ("again.nii.gz", "bone.nii.gz"):
             plant_in_nifti(folder / name)
+        plant_beside(folder / "again.nii.gz")
         (folder / "heel.inp").write_text(_abaqus(tiny_pair))
 
     return made_once("planted", fill)
@@ -95,6 +98,13 @@ def registered(made_once, inputs: Path) -> Path:
 def test_a_registration_names_no_patient(inputs: Path, registered: Path) -> None:
     assert {one.rpartition(": ")[2] for one in planted_in(inputs)} == set(PLANTED)
     assert planted_in(registered) == []
+    page = (registered / "out" / "report.html").read_text()
+    section = page.split("<h2>Acquisition and measurement</h2>")[1].split("</details>")[0]
+    rows = dict(re.findall(r"<th scope=row>([^<]*)</th>\s*<td>([^<]*)</td>", section))
+    assert rows["Scanner, manufacturer"] == "Siemens (unloaded image); not given (Load1, repeat)"
+    assert rows["Scanner, model"] == rows["Sequence, name"] == "not given"
+    assert rows["Field strength, T"] == "not given (unloaded image, Load1); 3 (repeat)"
+    assert rows["Flip angle, degrees"] == "12 (unloaded image); not given (Load1, repeat)"
 
 
 def test_an_enhanced_file_holds_all_names_and_is_read_as_the_series_is(inputs: Path) -> None:

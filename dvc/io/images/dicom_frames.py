@@ -95,7 +95,7 @@ class Frame:
 
 
 @contextmanager
-def _damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
+def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
     """Turn whatever fails on a damaged file, at any access, into an error that names the file and the kind of failure.
 
     Its text is left out, because it may quote the header.
@@ -118,7 +118,7 @@ def _damage_named(path: Path, problem: str = "not a readable DICOM file", remedy
 
 def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
     """Frames of a file, none if it is no image (a report); UID and number of files of the image that it belongs to."""
-    with _damage_named(path):
+    with damage_named(path):
         header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
         kind = header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or ""
         stored = pydicom.uid.UID(str(kind))
@@ -269,13 +269,13 @@ def read_values(frames: Sequence[Frame]) -> Float32Array:
 
 def _stored(path: Path, numbers: list[int], shape: tuple[int, int]) -> Iterator[Voxels]:
     """Stored values (rows, columns) of some frames of a file, numbered from 0, in the order given."""
-    with _damage_named(path):
+    with damage_named(path):
         header = pydicom.dcmread(path, specific_tags=[*_OF_PIXELS, *_OF_ALL])
         data = header.get("PixelData")
     if data is None:
         raise ImageFileError(f"{path}: the DICOM file has no pixels; it is damaged or incomplete. Export it again.")
     unusual = f"the file is damaged or incomplete, or its compression is not supported. {CONVERT}"
-    with _damage_named(path, "the pixels cannot be decoded", unusual):
+    with damage_named(path, "the pixels cannot be decoded", unusual):
         syntax = header.file_meta.get("TransferSyntaxUID")
         packed = syntax is not None and syntax.is_encapsulated
         count = int(header.get("NumberOfFrames") or 1)

@@ -90,6 +90,28 @@ def test_the_command_ends_with_status_2_where_something_is_wrong_and_0_where_not
     assert "ERROR" in ill.output
 
 
+def test_what_is_not_given_of_acquisition_and_credibility_is_a_note_in_one_line_each(study):
+    def told() -> dict[str, str]:
+        done = check(study)
+        assert not done.wrong
+        notes = [note.partition(": ") for note in done.notes if note.startswith("Not given in ")]
+        return {table.removeprefix("Not given in "): names for table, _, names in notes}
+
+    (study / "study.toml").write_text(STUDY.replace('"mine.toml", ', ""))
+    before = told()
+    assert list(before) == ["[acquisition]", "[credibility]"]
+    assert before["[credibility]"].startswith("question_of_interest, context_of_use, ")
+    (study / "Load0.json").write_text('{"FlipAngle": 12}')  # of dcm2niix
+    more = '[acquisition]\nsnr = 20.0\n[credibility]\nquestion_of_interest = "Which?"\n'
+    (study / "study.toml").write_text(STUDY.replace('"mine.toml", ', "") + more)
+    after = told()
+    assert set(before["[acquisition]"].split(", ")) - set(after["[acquisition]"].split(", ")) == {
+        "snr",
+        "flip_angle_deg",
+    }
+    assert after["[credibility]"].startswith("context_of_use, ")
+
+
 def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
     def told() -> list[str]:
         return [note for note in check(study).notes if note.startswith("WARNING: talus")]
