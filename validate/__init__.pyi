@@ -1,5 +1,6 @@
 from .agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from .comparison import Comparison, compare
+from .comparison_error import ComparisonError
 from .curves import RANGE, Area, Band, area_between, bands, check_range
 from .extrapolation import LEVELLED, extrapolated
 from .fe_result import FeResult, check_overlap, read_result
@@ -11,15 +12,16 @@ from .mapping import ALL, Field, MappedFields, check_bones, filled_from_nearest,
 from .measured_boundary import boundary_displacement, simulate_driven, write_boundary_conditions
 from .misfit import check_in_tissue, check_models, displacement_slip, misfits
 from .ranking import ALL_LOADS, CohortRank, Ranking, rank_over_loads, rank_over_subjects
+from .sensitivity import SHARED, Variant
 from .tables import Curve
 
 __all__ = [
-    "ALL", "ALL_LOADS", "LEAST_ML", "LEVELLED", "NOTHING", "RANGE", "Agreement", "Area", "Band", "CellGraph",
-    "CohortRank", "Comparison", "Criteria", "Curve", "FeResult", "Field", "GeometryError", "InputError", "LoadCase",
-    "LoadComparison", "MappedFields", "OutputError", "Overlap", "Ranking", "SkinDisplacement", "StrainCluster",
-    "Threshold", "agreements", "area_between", "bands", "boundary_displacement", "check_bones", "check_in_tissue",
-    "check_models", "check_overlap", "check_range", "compare", "compare_load", "displacement_slip", "extrapolated",
-    "filled_from_nearest", "map_fields", "misfits", "over_subjects", "overlap", "rank_over_loads",
-    "rank_over_subjects", "read_result", "read_thresholds", "simulate_driven", "skin_displacement",
-    "write_boundary_conditions",
+    "ALL", "ALL_LOADS", "LEAST_ML", "LEVELLED", "NOTHING", "RANGE", "SHARED", "Agreement", "Area", "Band",
+    "CellGraph", "CohortRank", "Comparison", "ComparisonError", "Criteria", "Curve", "FeResult", "Field",
+    "GeometryError", "InputError", "LoadCase", "LoadComparison", "MappedFields", "OutputError", "Overlap",
+    "Ranking", "SkinDisplacement", "StrainCluster", "Threshold", "Variant", "agreements", "area_between", "bands",
+    "boundary_displacement", "check_bones", "check_in_tissue", "check_models", "check_overlap", "check_range",
+    "compare", "compare_load", "displacement_slip", "extrapolated", "filled_from_nearest", "map_fields", "misfits",
+    "over_subjects", "overlap", "rank_over_loads", "rank_over_subjects", "read_result", "read_thresholds",
+    "simulate_driven", "skin_displacement", "write_boundary_conditions",
 ]  # fmt: skip

@@ -21,6 +21,7 @@ from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
+from validate.comparison_error import ComparisonError
 from validate.curves import Area
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
@@ -41,9 +42,9 @@ class Comparison:
 
     Attributes
     ----------
-    areas, overlaps, agreements, skin : tuple of Area, Overlap, Agreement, SkinDisplacement
+    areas, overlaps, agreements, skin, errors : tuple of Area, Overlap, Agreement, SkinDisplacement, ComparisonError
         Rows by load and model: area between strain-volume curves by tissue, location of clusters above thresholds,
-        agreement cell by cell, displacement of the skin.
+        agreement cell by cell, displacement of the skin, and comparison error of each figure with its uncertainties.
     curves : tuple of Curve
         Strain-volume curves, measured and simulated.
     ranking : Ranking
@@ -74,6 +75,7 @@ class Comparison:
     notes: tuple[str, ...]
     warnings: tuple[str, ...] = ()
     loads: tuple[LoadComparison, ...] = ()
+    errors: tuple[ComparisonError, ...] = ()
 
     def summary(self) -> list[str]:
         """Verdict, areas, and significant differences, one line each."""
@@ -190,7 +192,9 @@ class Comparison:
         levels = {load: of.level for load, of in known.items()}
         levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
         areas, ranking = (*self.areas, *self.ranking.areas, self.ranking.nothing), self.ranking
-        tables.write_tables(target, (areas, self.overlaps, self.agreements, self.skin), self.curves, levels)
+        tables.write_tables(
+            target, (areas, self.overlaps, self.agreements, self.skin, self.errors), self.curves, levels
+        )
         own: dict[str, object] = {
             "total_area_ml": {a.model: a.best_ml for a in ranking.areas}, "told_apart": list(ranking.statements),
             "not_told_apart": ranking.not_distinguishable, "notes": list(self.notes), "coverage_ml": self.coverage_ml,
@@ -212,7 +216,7 @@ class Comparison:
             If the folder does not contain a comparison.
         """
         place = Path(folder)
-        areas, overlaps, agreements, skin = tables.read_tables(place)
+        areas, overlaps, agreements, skin, errors = tables.read_tables(place)
         try:
             content = read_json(place / tables.RECORD)
             low, high = content["parameters"]["strains"]
@@ -226,8 +230,9 @@ class Comparison:
             raise InputError(f"{place / tables.RECORD} is not a valid record of a comparison ({error}).") from error
         by_load, curves = tuple(a for a in areas if a.load != ALL_LOADS), tables.read_curves(place)
         return cls(
-            by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes
-        )
+            by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes,
+            errors=errors,
+        )  # fmt: skip
 
 
 def _write_load(
@@ -303,6 +308,7 @@ def compare(
         curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
         ranking=rank_over_loads(loads), strains=by.strains, coverage_ml=coverage, verdict=verdict, verdicts=verdicts,
         notes=(*notes, *_doubts(verdict), *_limitations(loads)), warnings=tuple(odd), loads=tuple(loads),
+        errors=tuple(error for one in loads for error in one.errors),
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from validate import figures
 from validate.agreement import Agreement, SkinDisplacement
+from validate.comparison_error import validation_section
 from validate.curves import Area
 from validate.fe_result import FeResult
 from validate.load_comparison import NOTHING, LoadComparison
@@ -146,6 +147,7 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
         Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
+        *validation_section(one.load, one.errors, ALL),
         Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others), folded=True),
     ]
 

@@ -18,13 +18,17 @@ from dvc.file_names import as_file_name
 from dvc.own_files import read_json, read_rows
 from dvc.report.drawing import figure_files
 from validate.agreement import Agreement, SkinDisplacement
+from validate.comparison_error import ComparisonError
 from validate.curves import Area
 from validate.load_comparison import LoadComparison
 from validate.location import Overlap
 from validate.mapping import ALL
 
 RECORD = "comparison.json"
-TABLES = {"areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement}
+TABLES = {
+    "areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement,
+    "comparison_error.csv": ComparisonError,
+}  # fmt: skip
 CURVES = "curves.csv"
 OF_ALL_LOADS = ("slices_by_load", "curves_by_load")
 """Stems of the figures under all loads."""
