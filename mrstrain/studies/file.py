@@ -170,11 +170,16 @@ class Study(_Part):
     mesh: Mesh = Mesh()
     models: Models = Models()
     compare: modelling.ComparisonOptions = modelling.ComparisonOptions()
+    uncertainty: modelling.Uncertainty = modelling.Uncertainty()
     _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
 
     def at(self, table: str, key: str) -> str:
         """A key of a table with its line in the file, for messages."""
         return _named(self._lines, table, key)[1]
+
+    def quickly(self) -> Self:
+        """The same without the further solutions for the input uncertainty of the models."""
+        return self.model_copy(update={"uncertainty": self.uncertainty.model_copy(update={"quick": True})})
 
     @property
     def out(self) -> Path:

@@ -17,6 +17,10 @@ from mrstrain.records.progress import NOTE
 Tell = Callable[[str, float], None]
 _REGISTERING = {"aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2)}
 # of a registration's time: when each of its parts begins, and how much of it the part takes
+_LEFT_OUT = (
+    "The further solutions for the input uncertainty of the models were left out (quick): intervals and significant "
+    "differences take mesh, forces, directions and parameters of simulated models as exact."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +71,22 @@ def _whole(tell: Tell) -> Tell:
     return told
 
 
-def mesh(tell: Tell, *, labels: Path, **options: Any) -> StageResult:
-    """Mesh the soft tissue of a label map; as `mrstrain.mesh`."""
+def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any) -> StageResult:
+    """Mesh the soft tissue of a label map; as `mrstrain.mesh`, or with edges that are longer by a ratio."""
     from mrstrain.models.mesh import mesh as run
+    from mrstrain.models.vary import mesh_coarser
+    from mrstrain.options.modelling import Labelling, Meshing
 
-    lines = run(labels, watch=lambda share: tell("meshing", share), **options).summary()
+    def watch(share: float) -> None:
+        tell("meshing", share)
+
+    if ratio is None:
+        lines = run(labels, watch=watch, **options).summary()
+    else:
+        out, (how, which) = options.pop("out"), (
+            model.of({name: options[name] for name in model.model_fields}) for model in (Meshing, Labelling)
+        )  # fmt: skip
+        lines = mesh_coarser(labels, out=out, ratio=ratio, labelling=which, meshing=how, watch=watch).summary()
     return StageResult(tuple(lines), headline=lines[0])
 
 
@@ -92,6 +107,29 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
     done = run(mesh, loads=steps, workers=1, threads=1, progress=told, **options)
     headline = "; ".join(one.headline for one in done.sets)
     return StageResult(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), headline=headline)
+
+
+def vary(tell: Tell, *, mesh: Path, labels: Path, names: Path | None, loads: Sequence[Mapping[str, Any]],
+         uncertainty: Mapping[str, Any], **options: Any) -> StageResult:  # fmt: skip
+    """Solve a material set with one input changed at a time; as `mrstrain.models.vary`."""
+    from dvc import read_labels
+    from fe import LoadStep
+    from mrstrain.models.vary import vary as run
+    from mrstrain.options import modelling
+
+    kinds = {"simulation": modelling.SimulationOptions, "plate_options": modelling.PlateOptions,
+             "coordinates": modelling.MeshCoordinates}  # fmt: skip
+    models: dict[str, Any] = {
+        kind: model.of({name: options.pop(name) for name in model.model_fields if name in options})
+        for kind, model in kinds.items()
+    }
+    out = options.pop("out")
+    done = run(
+        mesh, out=out, loads=[LoadStep(**load) for load in loads],
+        uncertainty=modelling.Uncertainty.of(uncertainty), tell=tell,
+        voxel_mm=float(read_labels(labels, names).grid.spacing_mm.min()), **models, **options,
+    )  # fmt: skip
+    return StageResult(tuple(done.summary()), complete=done.complete, headline=done.lines[0])
 
 
 def drive(tell: Tell, *, sets: Sequence[str], **options: Any) -> StageResult:
@@ -121,5 +159,10 @@ def compare(tell: Tell, **options: Any) -> StageResult:
     from mrstrain.comparison.compare import compare as run
 
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
-    done = run(options.pop("dvc"), models, progress=lambda _, *stage: tell(*stage), **options)
+    variants = [*options.pop("variants", []), *options.pop("variants_elsewhere", [])]
+    remarks = [_LEFT_OUT] if options.pop("quick", False) else []
+    done = run(
+        options.pop("dvc"), models, variants=variants, remarks=remarks, progress=lambda _, *stage: tell(*stage),
+        **options,
+    )  # fmt: skip
     return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing, headline=done.comparison.headline)
