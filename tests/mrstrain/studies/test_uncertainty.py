@@ -1,4 +1,4 @@
-"""The input uncertainty of the models in a study: further solutions, which are cached, told by `check`, and left out."""
+"""The input uncertainty of the models in a study: further solutions, cached, told by `check`, and left out."""
 
 from __future__ import annotations
 
