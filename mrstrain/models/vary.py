@@ -8,16 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 import fe
-from dvc import Grid, LabelMap, TetMesh, read_labels, write_labels
+from dvc import TetMesh
 from dvc.atomic_files import write_whole
 from dvc.errors import MrstrainError
 from dvc.worker import Worker
 from fe import variation
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint
-from mrstrain.models.mesh import Meshed, mesh as make_mesh
 from mrstrain.models.simulate import material_sets, simulate
 from mrstrain.models.variant_files import VARIANT, VariantRecord
 from mrstrain.options import modelling as options
@@ -30,6 +27,7 @@ ORDER, SAFETY, COVERAGE = 1.0, 1.25, 2.0
 """Of the mesh: assumed order of the strain in linear cells, safety factor, and coverage factor of the expanded
 uncertainty SAFETY |f_fine - f_coarse| / (r^ORDER - 1), with the ratio r of the cell sizes."""
 _LEAST_RATIO = 1.1  # of cell sizes
+_SHORT = 0.2  # of the time of a whole solution: one that starts from the state of another
 _SKIN = "skin"
 
 
@@ -49,36 +47,6 @@ class _Setting:
         return fe.problems_of(self.mesh, self.materials, self.plates, self.loads, self.fixed, self.element)
 
 
-def mesh_coarser(labels: Path, *, out: Path, ratio: float, labelling: options.Labelling, meshing: options.Meshing,
-                 watch: Callable[[float], None]) -> Meshed:  # fmt: skip
-    """Mesh a label map with edges that are longer by a ratio, and with voxels as much larger, if no tissue is lost.
-
-    In thin tissues the voxels and not the edge length limit the size of the cells.
-    """
-    longer = meshing.model_copy(update={"edge_mm": ratio * meshing.edge_mm})
-    if longer.finer is not None:
-        longer = longer.model_copy(update={"finer": longer.finer._replace(edge_mm=ratio * longer.finer.edge_mm)})
-    given = read_labels(labels, labelling.names)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    place = out.with_name("labels.nii.gz")
-    write_labels(place, _coarser(given, ratio))
-    renamed = labelling.model_copy(update={"names": place.with_name("labels.csv")})
-    try:
-        return make_mesh.with_options(place, out=out, labelling=renamed, meshing=longer, watch=watch)
-    except MrstrainError:  # a tissue is too thin for these voxels
-        return make_mesh.with_options(labels, out=out, labelling=labelling, meshing=longer, watch=watch)
-
-
-def _coarser(labels: LabelMap, ratio: float) -> LabelMap:
-    """A label map with larger voxels, each with the label at its centre."""
-    grid = labels.grid
-    shape = tuple(int(n) for n in np.maximum(np.floor(np.array(grid.shape) / ratio), 1))
-    wide = Grid(shape, ratio * grid.spacing_mm, grid.points_at(np.full(3, 0.5 * (ratio - 1.0))), grid.direction)
-    at = np.rint(grid.indices_of(wide.points().reshape(-1, 3))).astype(np.int64)
-    at = np.clip(at, 0, np.array(grid.shape) - 1)
-    return LabelMap(wide, labels.labels[tuple(at.T)].reshape(shape), labels.names)
-
-
 def vary(
     mesh: Path, *, out: Path, simulation: options.SimulationOptions, loads: Sequence[fe.LoadStep],
     plate_options: options.PlateOptions, towards: Mapping[str, tuple[Vector, Vector]],
@@ -92,7 +60,7 @@ def vary(
     mesh, simulation, loads, plate_options, towards, coordinates
         As in `simulate`, with one set.
     out : path
-        Gets a folder for each input with a VTU file for each load and ``variant.toml``.
+        Gets a folder for each input, with a folder of the set that has a VTU file for each load and ``variant.toml``.
     uncertainty : Uncertainty
         Standard uncertainty of each input.
     base : path
@@ -110,66 +78,80 @@ def vary(
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
     usual = (plate_options.plate_normal, plate_options.shear_direction)
     plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}
-    setting = _Setting(chosen.name, read, plates, loads, fe.fixed_facets(read, simulation.fixed), simulation.element,
-                       chosen.for_regions(read.regions)[0])  # fmt: skip
-    lines, complete = list[str](), True
-    changed, tilts = _changes(setting, uncertainty, voxel_mm, lines), _tilts(setting, uncertainty)
-    whole, cheap = [*([MESH] if coarse is not None else []), *tilts], 0.2  # of the time of a whole solution
-    work, done = len(whole) + cheap * len(changed), 0.0
-    simulated = simulation.model_copy(update={"decks": False})
-    for name in whole:
-        directions = {load: (p.normal, p.shear) for load, p in plates.items()} if name == MESH else tilts[name]
+    setting = _Setting(
+        chosen.name, read, plates, loads, fe.fixed_facets(read, simulation.fixed), simulation.element,
+        chosen.for_regions(read.regions)[0],
+    )  # fmt: skip
+    changed, lines = _changes(setting, uncertainty, voxel_mm)
+    whole = ({} if coarse is None else {MESH: dict(towards)}) | _tilts(setting, uncertainty)
+    solving = simulation.model_copy(update={"decks": False})
+    complete, work = True, len(whole) + _SHORT * len(changed)
+    for number, (name, directions) in enumerate(whole.items()):
+        began: dict[str, float] = {}
+
+        def watch(case: str, stage: str, share: float, number: int = number, began: dict[str, float] = began) -> None:
+            began[case] = share
+            tell(stage, (number + min(sum(began.values()) / max(len(loads), 1), 1.0)) / work)
+
         try:
             made = simulate.with_options(
-                place, out=out / name, simulation=simulated, loads=loads, plate_options=plate_options, coordinates=how,
-                towards={load: (tuple(n), tuple(s)) for load, (n, s) in directions.items()},
-                cores=Cores(workers=1, threads=1),
-                progress=lambda case, stage, share, done=done: tell(stage, (done + share / 2.0) / work),  # type: ignore[misc]
+                place, out=out / name, simulation=solving, loads=loads, plate_options=plate_options, coordinates=how,
+                towards=directions, cores=Cores(workers=1, threads=1), progress=watch,
             )  # fmt: skip
             complete = complete and made.complete
         except MrstrainError as failure:
             complete = False
             lines.append(f"{name}: FAILED. {failure}")
-        done += 1.0
+    of_base = None
     if coarse is not None:
-        base = out / MESH / chosen.name
-        lines += _mesh_record(base, chosen.name, fe.read_tet_mesh(mesh, unit=coordinates.mesh_unit), read)
-    of_base = None if coarse is None else base
-    for name in tilts:
-        _record(
-            out / name / chosen.name,
-            VariantRecord.of_folders(chosen.name, name, 1.0, of_base, out / name / chosen.name),
-        )
+        of_base = base = out / MESH / chosen.name
+        fine = fe.read_tet_mesh(mesh, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
+        lines.append(_record_mesh(base, chosen.name, fine, read))
+    for name in whole.keys() - {MESH}:
+        _record(out / name / chosen.name, chosen.name, name, 1.0, of_base)
     states = _states(setting, base)
+    failed = _solve_short(changed, states, out, of_base, chosen.name,
+                          lambda done: tell("varying", (len(whole) + _SHORT * done) / work))  # fmt: skip
+    lines = [
+        f"{chosen.name} with one input changed: {', '.join([*whole, *changed]) or 'none'} ({len(states)} loads)",
+        *lines, *failed,
+    ]  # fmt: skip
+    return Outcome(out, tuple(lines), complete and not failed and len(states) == len(loads))
+
+
+def _solve_short(
+    changed: Mapping[str, tuple[list[fe.Problem], float]], states: Mapping[str, fe.Checkpoint], out: Path,
+    base: Path | None, chosen: str, ended: Callable[[int], None],
+) -> list[str]:  # fmt: skip
+    """Solve changed problems that start from known states, unless they are solved; a sentence for each that failed."""
+    failed = []
     with Worker(threads=1) as worker:
-        for name, (problems, steps) in changed.items():
-            folder = out / name / chosen.name
-            record = VariantRecord.of_folders(chosen.name, name, steps, of_base, folder)
-            made_from = [fingerprint(one, len(one.loads)) for one in problems]
+        for number, (name, (problems, steps)) in enumerate(changed.items(), start=1):
+            folder, made_from = out / name / chosen, [fingerprint(one, len(one.loads)) for one in problems]
             if not _is_made(folder, made_from, states):
                 (folder / VARIANT).unlink(missing_ok=True)
                 try:
                     worker.run(f"varying {name}", solve_from_base, problems, states, folder)
-                    write_whole(folder / _MADE_FROM, "\n".join(made_from))
                 except MrstrainError as failure:
-                    complete = False
-                    lines.append(f"{name}: FAILED. {failure}")
+                    failed.append(f"{name}: FAILED. {failure}")
                     continue
-            _record(folder, record)
-            done += cheap
-            tell("varying", done / work)
-    names = [*whole, *changed]
-    lines.insert(0, f"{chosen.name} with one input changed: {', '.join(names) or 'none'} ({len(states)} loads)")
-    return Outcome(out, tuple(lines), complete and len(states) == len(loads))
+                write_whole(folder / _MADE_FROM, "\n".join(made_from))
+            _record(folder, chosen, name, steps, base)
+            ended(number)
+    return failed
 
 
 _MADE_FROM = "made-from.txt"
 
 
 def _changes(
-    setting: _Setting, spread: options.Uncertainty, voxel_mm: float, lines: list[str]
-) -> dict[str, tuple[list[fe.Problem], float]]:
-    """Changed problems by input, that can start from the states of the unchanged ones, and the steps of each."""
+    setting: _Setting, spread: options.Uncertainty, voxel_mm: float
+) -> tuple[dict[str, tuple[list[fe.Problem], float]], list[str]]:
+    """Changed problems by input, that start from the states of the unchanged ones, with the steps of each.
+
+    Also a sentence for each that cannot be made.
+    """
+    lines = list[str]()
     made: dict[str, tuple[_Setting, float]] = {}
     stronger = [variation.with_force(load, spread.force, spread.force_n) for load in setting.loads]
     if stronger != list(setting.loads):
@@ -191,7 +173,7 @@ def _changes(
                 made[name] = replace(setting, mesh=moved), share
             except MrstrainError as failure:
                 lines.append(f"{name}: not given. {failure}")
-    return {name: (of.problems(), steps) for name, (of, steps) in made.items()}
+    return {name: (of.problems(), steps) for name, (of, steps) in made.items()}, lines
 
 
 def _tilts(setting: _Setting, spread: options.Uncertainty) -> dict[str, dict[str, tuple[Vector, Vector]]]:
@@ -200,27 +182,32 @@ def _tilts(setting: _Setting, spread: options.Uncertainty) -> dict[str, dict[str
         return {}
     tilts: dict[str, dict[str, tuple[Vector, Vector]]] = {}
     for name, along in (("direction-along", True), ("direction-across", False)):
-        axes = {load: variation.tilted(plate, spread.direction_deg, along=along).axes
-                for load, plate in setting.plates.items()}  # fmt: skip
-        tilts[name] = {load: (tuple((-of[:, 0]).tolist()), tuple(of[:, 1].tolist())) for load, of in axes.items()}
+        turned = {
+            load: variation.tilted(plate, spread.direction_deg, along=along).axes.T.tolist()
+            for load, plate in setting.plates.items()
+        }
+        tilts[name] = {
+            load: ((-force[0], -force[1], -force[2]), (shear[0], shear[1], shear[2]))
+            for load, (force, shear, _) in turned.items()
+        }
     return tilts
 
 
-def _mesh_record(folder: Path, name: str, fine: TetMesh, coarse: TetMesh) -> list[str]:
-    """Record the solution on the coarser mesh as a variant, unless the meshes are too much alike."""
+def _record_mesh(folder: Path, name: str, fine: TetMesh, coarse: TetMesh) -> str:
+    """Record the solution on the coarser mesh as a variant, unless the meshes are too much alike; what was found."""
     ratio = fe.cell_size_mm(coarse) / fe.cell_size_mm(fine)
     told = f"mesh: cells of {fe.cell_size_mm(fine):.2f} and {fe.cell_size_mm(coarse):.2f} mm, a ratio of {ratio:.2f}"
     if ratio < _LEAST_RATIO:
         (folder / VARIANT).unlink(missing_ok=True)
-        return [f"{told}; below {_LEAST_RATIO:g} no error of the mesh can be estimated."]
+        return f"{told}; below {_LEAST_RATIO:g} no error of the mesh can be estimated."
     steps = COVERAGE * (ratio**ORDER - 1.0) / SAFETY
-    _record(folder, VariantRecord.of_folders(name, MESH, steps, None, folder))
-    return [f"{told}; one standard uncertainty is {1.0 / steps:.1f} times the difference of the two solutions."]
+    _record(folder, name, MESH, steps, None)
+    return f"{told}; one standard uncertainty is {1.0 / steps:.1f} times the difference of the two solutions."
 
 
-def _record(folder: Path, record: VariantRecord) -> None:
+def _record(folder: Path, model: str, name: str, steps: float, base: Path | None) -> None:
     if folder.is_dir():
-        write_whole(folder / VARIANT, record.text)
+        write_whole(folder / VARIANT, VariantRecord.of_folders(model, name, steps, base, folder).text)
 
 
 def _states(setting: _Setting, folder: Path) -> dict[str, fe.Checkpoint]:

@@ -217,13 +217,14 @@ def _variation(study: Study, simulation: Stage) -> Stage:
     coarse = study.out / COARSE_MESH if coarser(study) else None
     spread = study.uncertainty.model_dump(exclude={"variants", "quick"})
     labels, names = labels_to_mesh(study)
+    out = study.out / VARIANTS / folder.name
     own = {
-        "out": study.out / VARIANTS / folder.name, "base": folder, "coarse": coarse, "labels": labels, "names": names,
+        "out": out, "base": folder, "coarse": coarse, "labels": labels, "names": names,
         "uncertainty": spread,
     }  # fmt: skip
     after = dict.fromkeys((*simulation.after, *((COARSE,) if coarse else (simulation.name,)), *_labelled(study)))
     files = (*simulation.files, *study.given([labels, names]))
-    return Stage(f"vary {folder.name}", {**simulation.arguments, **own}, files, (own["out"],), tuple(after))
+    return Stage(f"vary {folder.name}", {**simulation.arguments, **own}, files, (out,), tuple(after))
 
 
 def _on_mesh(

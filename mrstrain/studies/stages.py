@@ -7,13 +7,15 @@ returns its contribution to the report and the log.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dvc import Verdict
 from dvc.report.page import Section
 from dvc.worker import Worker
+from mrstrain.options.model import Options
 from mrstrain.records.progress import NOTE
 
+_M = TypeVar("_M", bound=Options)
 Tell = Callable[[str, float], None]
 _REGISTERING = {"aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2)}
 # of a registration's time: when each of its parts begins, and how much of it the part takes
@@ -73,8 +75,7 @@ def _whole(tell: Tell) -> Tell:
 
 def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any) -> StageResult:
     """Mesh the soft tissue of a label map; as `mrstrain.mesh`, or with edges that are longer by a ratio."""
-    from mrstrain.models.mesh import mesh as run
-    from mrstrain.models.vary import mesh_coarser
+    from mrstrain.models.mesh import mesh as run, mesh_coarser
     from mrstrain.options.modelling import Labelling, Meshing
 
     def watch(share: float) -> None:
@@ -83,11 +84,14 @@ def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any
     if ratio is None:
         lines = run(labels, watch=watch, **options).summary()
     else:
-        out, (how, which) = options.pop("out"), (
-            model.of({name: options[name] for name in model.model_fields}) for model in (Meshing, Labelling)
-        )  # fmt: skip
-        lines = mesh_coarser(labels, out=out, ratio=ratio, labelling=which, meshing=how, watch=watch).summary()
+        how, which = _chosen(Meshing, options), _chosen(Labelling, options)
+        lines = mesh_coarser(labels, ratio=ratio, labelling=which, meshing=how, watch=watch, **options).summary()
     return StageResult(tuple(lines), headline=lines[0])
+
+
+def _chosen(model: type[_M], options: dict[str, Any]) -> _M:
+    """A model of options, whose fields are taken out of the others."""
+    return model.of({name: options.pop(name) for name in model.model_fields if name in options})
 
 
 def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **options: Any) -> StageResult:
@@ -109,25 +113,22 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
     return StageResult(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), headline=headline)
 
 
-def vary(tell: Tell, *, mesh: Path, labels: Path, names: Path | None, loads: Sequence[Mapping[str, Any]],
-         uncertainty: Mapping[str, Any], **options: Any) -> StageResult:  # fmt: skip
-    """Solve a material set with one input changed at a time; as `mrstrain.models.vary`."""
+def vary(
+    tell: Tell, *, mesh: Path, labels: Path, names: Path | None, loads: Sequence[Mapping[str, Any]],
+    uncertainty: Mapping[str, Any], **options: Any,
+) -> StageResult:  # fmt: skip
+    """Solve a material set with one input changed at a time; as `mrstrain.models.vary.vary`."""
     from dvc import read_labels
     from fe import LoadStep
     from mrstrain.models.vary import vary as run
-    from mrstrain.options import modelling
+    from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions, Uncertainty
 
-    kinds = {"simulation": modelling.SimulationOptions, "plate_options": modelling.PlateOptions,
-             "coordinates": modelling.MeshCoordinates}  # fmt: skip
-    models: dict[str, Any] = {
-        kind: model.of({name: options.pop(name) for name in model.model_fields if name in options})
-        for kind, model in kinds.items()
-    }
-    out = options.pop("out")
+    voxel_mm = float(read_labels(labels, names).grid.spacing_mm.min())
+    simulation, plate = _chosen(SimulationOptions, options), _chosen(PlateOptions, options)
     done = run(
-        mesh, out=out, loads=[LoadStep(**load) for load in loads],
-        uncertainty=modelling.Uncertainty.of(uncertainty), tell=tell,
-        voxel_mm=float(read_labels(labels, names).grid.spacing_mm.min()), **models, **options,
+        mesh, simulation=simulation, plate_options=plate, coordinates=_chosen(MeshCoordinates, options),
+        loads=[LoadStep(**load) for load in loads], uncertainty=Uncertainty.of(uncertainty), voxel_mm=voxel_mm,
+        tell=tell, **options,
     )  # fmt: skip
     return StageResult(tuple(done.summary()), complete=done.complete, headline=done.lines[0])
 
