@@ -20,6 +20,7 @@ from mrstrain.models.variant_files import VARIANT, VariantRecord
 from mrstrain.options import modelling as options
 from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
+from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.outcome import Outcome
 
 MESH = "mesh"
@@ -50,7 +51,7 @@ class _Setting:
 def vary(
     mesh: Path, *, out: Path, simulation: options.SimulationOptions, loads: Sequence[fe.LoadStep],
     plate_options: options.PlateOptions, towards: Mapping[str, tuple[Vector, Vector]],
-    coordinates: options.MeshCoordinates, uncertainty: options.Uncertainty, base: Path, coarse: Path | None = None,
+    coordinates: options.MeshCoordinates, uncertainty: Uncertainty, base: Path, coarse: Path | None = None,
     voxel_mm: float = 0.0, tell: Callable[[str, float], None] = lambda _stage, _share: None,
 ) -> Outcome:  # fmt: skip
     """Solve a material set with each input changed by one standard uncertainty.
@@ -145,7 +146,7 @@ _MADE_FROM = "made-from.txt"
 
 
 def _changes(
-    setting: _Setting, spread: options.Uncertainty, voxel_mm: float
+    setting: _Setting, spread: Uncertainty, voxel_mm: float
 ) -> tuple[dict[str, tuple[list[fe.Problem], float]], list[str]]:
     """Changed problems by input, that start from the states of the unchanged ones, with the steps of each.
 
@@ -176,7 +177,7 @@ def _changes(
     return {name: (of.problems(), steps) for name, (of, steps) in made.items()}, lines
 
 
-def _tilts(setting: _Setting, spread: options.Uncertainty) -> dict[str, dict[str, tuple[Vector, Vector]]]:
+def _tilts(setting: _Setting, spread: Uncertainty) -> dict[str, dict[str, tuple[Vector, Vector]]]:
     """Outward normal and direction of shear of each load with a tilted plate, by input."""
     if not spread.direction_deg:
         return {}

@@ -16,6 +16,7 @@ from dvc.io.result_folder import REPEAT
 from mrstrain.options import modelling
 from mrstrain.options.measurement import AUTO, Frame, RegistrationOptions, SubjectFiles, Unit, command_parts
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
+from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.inputs import made_labels
 
 FILE = "study.toml"
@@ -170,7 +171,7 @@ class Study(_Part):
     mesh: Mesh = Mesh()
     models: Models = Models()
     compare: modelling.ComparisonOptions = modelling.ComparisonOptions()
-    uncertainty: modelling.Uncertainty = modelling.Uncertainty()
+    uncertainty: Uncertainty = Uncertainty()
     _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
 
     def at(self, table: str, key: str) -> str:

@@ -121,7 +121,8 @@ def vary(
     from dvc import read_labels
     from fe import LoadStep
     from mrstrain.models.vary import vary as run
-    from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions, Uncertainty
+    from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
+    from mrstrain.options.uncertainty import Uncertainty
 
     voxel_mm = float(read_labels(labels, names).grid.spacing_mm.min())
     simulation, plate = _chosen(SimulationOptions, options), _chosen(PlateOptions, options)

@@ -13,6 +13,7 @@ from mrstrain.models.simulate import simulate
 from mrstrain.models.variant_files import variant_folders
 from mrstrain.models.vary import vary
 from mrstrain.options import modelling as options
+from mrstrain.options.uncertainty import Uncertainty
 from tests.blocks import block
 from validate import read_result
 
@@ -46,8 +47,8 @@ def given(tmp_path_factory) -> dict[str, object]:
     }  # fmt: skip
 
 
-def spread(**inputs: object) -> options.Uncertainty:
-    return options.Uncertainty.of(inputs)
+def spread(**inputs: object) -> Uncertainty:
+    return Uncertainty.of(inputs)
 
 
 def test_each_uncertain_input_has_a_solution_that_is_kept(given) -> None:
