@@ -124,7 +124,7 @@ def main() -> None:
 def hidden_model(work: Path, labels: LabelMap, seed: int) -> Path:
     """Mesh the heel, mix its fat, and simulate the loads; the folder of the results."""
     done = work / "simulated" / "hidden"
-    if (done / "simulation.json").is_file():
+    if (done / "regions.csv").is_file():  # written when the simulation has ended
         return done
     # The whole foot that the images show: a motion carried on beyond a mesh would change tissue's volume there.
     write_labels(work / "whole.nii.gz", labels)

@@ -12,16 +12,16 @@ from .problem import LoadStep, Problem, check_loads, check_materials, paths_of, 
 from .published import MaterialSet, as_toml, material_set, published_names, read_material_sets
 from .result import RegionFigures, cauchy_stress, equivalent_stress, region_figures, write_regions_csv, write_state
 from .simulation import Simulation, simulate
-from .simulation_files import clear_simulation
+from .simulation_files import begin_simulation
 from .solution import LoadState, Observer, SolverOptions, solve
 
 __all__ = [
     "BONE", "CUT", "LAWS", "MODES", "SKIN", "Checkpoint", "Curve", "Fit", "Hencky", "InputError", "Limit",
     "LoadState", "LoadStep", "Material", "MaterialSet", "MeshQuality", "MrstrainError", "NeoHooke", "Observer",
     "Ogden", "OutputError", "Plate", "PlateState", "Problem", "RegionFigures", "Simulation", "SolverOptions",
-    "TetMesh", "Tolerance", "WorkerError", "Yeoh", "as_toml", "cauchy_stress", "cell_size_mm", "check_loads",
-    "check_materials", "check_meshing", "clear_simulation", "equivalent_stress", "extrapolate", "fit",
-    "fixed_facets", "material_set", "mesh_labels", "paths_of", "problems_of", "published_names", "read_curves",
+    "TetMesh", "Tolerance", "WorkerError", "Yeoh", "as_toml", "begin_simulation", "cauchy_stress", "cell_size_mm",
+    "check_loads", "check_materials", "check_meshing", "equivalent_stress", "extrapolate", "fit", "fixed_facets",
+    "material_set", "mesh_labels", "paths_of", "problems_of", "published_names", "read_curves",
     "read_material_sets", "read_tet_mesh", "region_figures", "simulate", "solve", "write_calculix", "write_febio",
     "write_regions_csv", "write_state", "write_tet_mesh",
 ]  # fmt: skip

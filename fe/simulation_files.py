@@ -1,6 +1,7 @@
 """Files of a simulation: reading results, resuming after an interruption, and removing old files."""
 
 import hashlib
+from contextlib import suppress
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
-from dvc.atomic_files import whole_file
+from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
 from dvc.mesh import outer_faces
 from dvc.own_files import read_arrays, read_json
@@ -43,6 +44,8 @@ def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
 
 def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     content = read_json(place / RECORD)
+    if content["outcome"] == {}:
+        raise ValueError("the simulation has not ended, or reached no load")
     given, outcome = content["parameters"], content["outcome"]
     paths = tuple(tuple(LoadStep(**load) for load in path) for path in given["paths"])
     loads = {load.name: load for path in paths for load in path}
@@ -88,15 +91,19 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def clear_simulation(folder: Path) -> None:
-    """Remove the files of an earlier simulation, listed in its own record, so that old and new are never mixed."""
-    try:
+def begin_simulation(folder: Path) -> None:
+    """Remove the files of an earlier simulation, listed in its own record, so that old and new are never mixed.
+
+    The record then has no load until the simulation ends: the last file of a load that was written before may be that
+    of a part of it.
+    """
+    loads = list[str]()
+    with suppress(OSError, ValueError, KeyError, TypeError):  # there is none, or it is damaged
         loads = list(read_json(folder / RECORD)["outcome"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return
     of_loads = [name for load in loads for name in (f"{load}.vtu", f"{load}.inp", f"{load}.feb", f"log-{load}.txt")]
-    for name in (*of_loads, *_TABLES, RECORD):
+    for name in (*of_loads, *_TABLES):
         (folder / name).unlink(missing_ok=True)
+    write_json(folder / RECORD, {"outcome": {}})
 
 
 def fingerprint(problem: Problem, load_count: int) -> str:

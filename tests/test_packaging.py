@@ -96,6 +96,13 @@ def test_the_command_line_starts_without_the_heavy_libraries() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_a_registration_loads_nothing_of_the_labelling() -> None:
+    """It brings scipy.stats and skimage.restoration, which take as long as a fifth of all its imports."""
+    code = "import sys, mrstrain.measurement.register; print('scipy.stats' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_help_comes_in_under_a_second() -> None:
     """Of processor time, since other programs take theirs from the clock."""
     code = (

@@ -17,20 +17,22 @@ from dvc.file_names import refuse_as_file_name
 from dvc.own_files import read_json
 from dvc.report.drawing import png_bytes
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
+from dvc.report.strips import Strip
 from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
 from validate.comparison_error import ComparisonError
 from validate.curves import Area
+from validate.decomposition import Representation
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
 from validate.location import Overlap
 from validate.mapping import ALL
+from validate.mavm import ModelForm
 from validate.misfit import check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import Drawn, area_rows, closing_sections, draw, drawings_of_all, load_sections, overview, shown
-from validate.strain_by_load import Strip
 from validate.tables import Curve
 
 _COVERED = 0.9  # fraction of the mesh; a model that covers less is noted
@@ -45,6 +47,8 @@ class Comparison:
     areas, overlaps, agreements, skin, errors : tuple of Area, Overlap, Agreement, SkinDisplacement, ComparisonError
         Rows by load and model: area between strain-volume curves by tissue, location of clusters above thresholds,
         agreement cell by cell, displacement of the skin, and comparison error of each figure with its uncertainties.
+    representations, model_forms : tuple of Representation, ModelForm
+        Rows by load, model and tissue: image decomposition (CWA 16799), modified area validation metric.
     curves : tuple of Curve
         Strain-volume curves, measured and simulated.
     ranking : Ranking
@@ -66,6 +70,8 @@ class Comparison:
     overlaps: tuple[Overlap, ...]
     agreements: tuple[Agreement, ...]
     skin: tuple[SkinDisplacement, ...]
+    representations: tuple[Representation, ...]
+    model_forms: tuple[ModelForm, ...]
     curves: tuple[Curve, ...]
     ranking: Ranking
     strains: tuple[float, float]
@@ -192,9 +198,8 @@ class Comparison:
         levels = {load: of.level for load, of in known.items()}
         levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
         areas, ranking = (*self.areas, *self.ranking.areas, self.ranking.nothing), self.ranking
-        tables.write_tables(
-            target, (areas, self.overlaps, self.agreements, self.skin, self.errors), self.curves, levels
-        )
+        rows = areas, self.overlaps, self.agreements, self.skin, self.representations, self.model_forms, self.errors
+        tables.write_tables(target, rows, self.curves, levels)
         own: dict[str, object] = {
             "total_area_ml": {a.model: a.best_ml for a in ranking.areas}, "told_apart": list(ranking.statements),
             "not_told_apart": ranking.not_distinguishable, "notes": list(self.notes), "coverage_ml": self.coverage_ml,
@@ -216,7 +221,7 @@ class Comparison:
             If the folder does not contain a comparison.
         """
         place = Path(folder)
-        areas, overlaps, agreements, skin, errors = tables.read_tables(place)
+        areas, overlaps, agreements, skin, represented, forms, errors = tables.read_tables(place)
         try:
             content = read_json(place / tables.RECORD)
             low, high = content["parameters"]["strains"]
@@ -229,10 +234,8 @@ class Comparison:
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{place / tables.RECORD} is not a valid record of a comparison ({error}).") from error
         by_load, curves = tuple(a for a in areas if a.load != ALL_LOADS), tables.read_curves(place)
-        return cls(
-            by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes,
-            errors=errors,
-        )  # fmt: skip
+        rows = by_load, overlaps, agreements, skin, represented, forms
+        return cls(*rows, curves, ranking, (low, high), coverage, verdict, verdicts, notes, errors=errors)
 
 
 def _write_load(
@@ -305,6 +308,8 @@ def compare(
         overlaps=tuple(o for one in loads for o in one.overlaps),
         agreements=tuple(a for one in loads for a in one.agreements),
         skin=tuple(s for one in loads for s in one.skin),
+        representations=tuple(r for one in loads for r in one.representations),
+        model_forms=tuple(m for one in loads for m in one.model_forms),
         curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
         ranking=rank_over_loads(loads), strains=by.strains, coverage_ml=coverage, verdict=verdict, verdicts=verdicts,
         notes=(*notes, *_doubts(verdict), *_limitations(loads)), warnings=tuple(odd), loads=tuple(loads),

@@ -19,10 +19,12 @@ from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from validate.comparison_error import ComparisonError, comparison_errors
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
+from validate.decomposition import Decomposition, Representation, decompose, representation
 from validate.extrapolation import LEVELLED
 from validate.fe_result import FeResult
 from validate.location import Overlap, Threshold
 from validate.mapping import ALL, MappedFields, map_fields
+from validate.mavm import ModelForm, model_form
 from validate.sensitivity import Sensitivity, changes_of
 
 _STRAINED = 0.01
@@ -146,8 +148,11 @@ class LoadComparison:
         Labels of the unloaded image, and those that are bone.
     areas : tuple of Area
         By model and tissue, with all soft tissue first. Those of `NOTHING` are last.
-    bands : mapping of tissue to Band
-        Empty where the measurement uncertainty is unknown.
+    model_forms : tuple of ModelForm
+        Modified area validation metric, by model and tissue.
+    bands, decompositions : mapping of tissue to Band, to Decomposition
+        Empty where the measurement uncertainty is unknown. Each tissue is decomposed for itself, since strain is
+        discontinuous at interfaces.
     errors : tuple of ComparisonError
         Comparison error of each figure, with its uncertainties; empty likewise.
     """
@@ -161,8 +166,16 @@ class LoadComparison:
     overlaps: tuple[Overlap, ...]
     agreements: tuple[Agreement, ...]
     skin: tuple[SkinDisplacement, ...]
+    model_forms: tuple[ModelForm, ...]
     bands: Mapping[str, Band]
+    decompositions: Mapping[str, Decomposition]
     errors: tuple[ComparisonError, ...] = ()
+
+    @property
+    def representations(self) -> tuple[Representation, ...]:
+        """How well each model, and `NOTHING`, represents the measured strain of each tissue."""
+        of = self.decompositions.items()
+        return tuple(representation((name, self.load, tissue), by) for tissue, by in of for name in by.models)
 
     @property
     def load(self) -> str:
@@ -209,14 +222,18 @@ def compare_load(
         case = replace(case, error=None)  # it is known by distance to bone
     uncertain = {} if case.error is None else _sensitivities(fields, results, by)
     known = {} if case.error is None else _bands(fields, case, case.error, by, truths, uncertain)
-    normal, levels = -case.axes[:, 0], [threshold.max_shear for threshold in by.thresholds]
+    normal, cells = -case.axes[:, 0], location.CellGraph.of(fields.mesh)
+    levels = [threshold.max_shear for threshold in by.thresholds]
     return LoadComparison(
         case, labels, tuple(bones), by, fields,
         areas=tuple(_areas(fields, case.load, known, by)),
-        overlaps=tuple(_overlaps(fields, case, by, truths)),
+        overlaps=tuple(_overlaps(fields, case, by, truths, cells)),
         agreements=tuple(row for name in models for row in agreements(fields, name, case.load)),
         skin=tuple(skin_displacement(fields, name, case.load, of, measured, normal) for name, of in models.items()),
-        bands=known, errors=tuple(comparison_errors(case.load, fields, known, uncertain, levels, by.strains)),
+        model_forms=tuple(_model_forms(fields, case.load)),
+        bands=known,
+        decompositions={} if case.error is None else _decompositions(fields, case.error, np.array(truths), cells),
+        errors=tuple(comparison_errors(case.load, fields, known, uncertain, levels, by.strains)),
     )  # fmt: skip
 
 
@@ -245,8 +262,31 @@ def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Crite
             yield Area(name, load, tissue, area, normalised, *estimated)
 
 
-def _overlaps(fields: MappedFields, case: LoadCase, by: Criteria, truths: Sequence[FloatArray]) -> Sequence[Overlap]:
-    common, cells = fields.common, location.CellGraph.of(fields.mesh)
+def _model_forms(fields: MappedFields, load: str) -> Iterator[ModelForm]:
+    for name, shear in _shears(fields).items():
+        for tissue, where in fields.parts.items():
+            measured, volumes = fields.measured.max_shear[where], fields.volumes_ml[where]
+            yield model_form((name, load, tissue), measured, shear[where], volumes)
+
+
+def _decompositions(
+    fields: MappedFields, error: ErrorTable, truths: FloatArray, cells: location.CellGraph
+) -> dict[str, Decomposition]:
+    """Each tissue's fields in coefficients; ``truths`` (m, n) in the common cells."""
+    made = {}
+    for tissue, where in list(fields.parts.items())[1:]:
+        measured, models = fields.measured.max_shear[where], {n: of[where] for n, of in _shears(fields).items()}
+        bias, sd = error.expected(tissue.lower(), measured, fields.to_bone_mm[where].astype(np.float32))
+        u_cal = float(np.sqrt(np.average(bias**2 + sd**2, weights=fields.volumes_ml[where])))
+        drawn = truths[:, where[fields.common]]
+        made[tissue] = decompose(measured, models, cells.part(where), u_cal, drawn, error.factor)
+    return made
+
+
+def _overlaps(
+    fields: MappedFields, case: LoadCase, by: Criteria, truths: Sequence[FloatArray], cells: location.CellGraph
+) -> Sequence[Overlap]:
+    common = fields.common
     measured = np.where(common, fields.measured.max_shear, -1.0)
     simulated = {name: np.where(common, model.max_shear, -1.0) for name, model in fields.models.items()}
     rows = [

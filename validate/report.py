@@ -11,7 +11,8 @@ from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
 from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
-from validate import figures
+from dvc.report.strips import MEASURED, Strip, strain_by_load
+from validate import figures, standards
 from validate.agreement import Agreement, SkinDisplacement
 from validate.comparison_error import validation_section
 from validate.curves import Area
@@ -20,7 +21,7 @@ from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
 from validate.ranking import ALL_LOADS, Ranking, no_nearer
-from validate.strain_by_load import MEASURED, Strip, strain_by_load
+from validate.strip import strip_of
 from validate.tables import Curve
 
 _AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
@@ -28,6 +29,7 @@ _DIFFERENCES = (  # stem of the files, quantity, its name with its unit in the c
     ("differences_shear", "max_shear", "max_shear", "Differences of maximum shear strain"),
     ("differences_u", "u_mm", "displacement_mm", "Differences of displacement magnitude"),
 )
+_COEFFICIENTS = "coefficients"  # stem of the files
 _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
 _CLOSING = Section(
     "How to read this",
@@ -85,7 +87,9 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
         bins = figures.difference_bins(fields, quantity)
         data = figures.columns_of(bins, f"mean_{name}", f"difference_{name}")
         drawings[stem] = Drawing.of(title, figures.differences, bins, one, quantity, data=data)
-    return drawings, _viewer(one, measured, results, image), Strip.of(one, measured, results, lowest)
+    if (of_coefficients := standards.drawing(one, models)) is not None:
+        drawings[_COEFFICIENTS] = of_coefficients
+    return drawings, _viewer(one, measured, results, image), strip_of(one, measured, results, lowest)
 
 
 def _place(one: LoadComparison) -> str:
@@ -136,19 +140,20 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
 
 
 def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: Viewer) -> list[Section]:
-    """Sections of a load: amount and location of strain, then agreement cell by cell."""
+    """Sections of a load: amount and location of strain, agreement cell by cell, and what the standards ask for."""
     verdict = one.case.verdict
     words = [
         "Compared volume: {common:.1f} mL of {mesh:.1f} mL of soft tissue in the mesh; the measurement is defined in "
         "{measured:.1f} mL.".format(**one.fields.coverage())
     ]
     words += [] if verdict is None else [f"Verdict on the registration: {verdict.words}."]
-    curves, slices, *others = pictures.values()
+    curves, slices, *others = (picture for stem, picture in pictures.items() if stem != _COEFFICIENTS)
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
         Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
         *validation_section(one.load, one.errors, ALL),
         Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others), folded=True),
+        standards.section(one, pictures.get(_COEFFICIENTS)),
     ]
 
 
@@ -157,13 +162,10 @@ def drawings_of_all(
 ) -> dict[str, Drawing]:
     """The first figures of a report, by the stem of their files: slices and curves under all loads."""
     model = ranking.areas[0].model if ranking.areas else next(n for n in strips[0].max_shear if n != MEASURED)
-    pages = [strip.max_shear[name] for strip in strips for name in (MEASURED, model) if name in strip.max_shear]
-    known = np.concatenate([page[np.isfinite(page)] for page in pages])
-    highest = max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
     informative = ranking.areas and ALL_LOADS not in ranking.uninformative
     best = "the best match over all loads" if informative else "a model"
-    note = f"Lower row: {model}, {best}. {strips[0].title}, through {strips[0].place}."
-    slices, of_all = (strips, model, highest), [curve for curve in curves if curve.tissue == ALL]
+    note = f"Upper row: measured. Lower row: {model}, {best}. {strips[0].title}, through {strips[0].place}."
+    slices, of_all = (strips, (MEASURED, model)), [curve for curve in curves if curve.tissue == ALL]
     return {
         "slices_by_load": Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note),
         "curves_by_load": Drawing.of("Strain-volume curves, all soft tissue", figures.curves_by_load, of_all, strains),

@@ -20,15 +20,19 @@ from dvc.report.drawing import figure_files
 from validate.agreement import Agreement, SkinDisplacement
 from validate.comparison_error import ComparisonError
 from validate.curves import Area
+from validate.decomposition import Representation
 from validate.load_comparison import LoadComparison
 from validate.location import Overlap
 from validate.mapping import ALL
+from validate.mavm import ModelForm
 
 RECORD = "comparison.json"
 TABLES = {
     "areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement,
+    "decomposition.csv": Representation, "mavm.csv": ModelForm,
     "comparison_error.csv": ComparisonError,
 }  # fmt: skip
+_LATER = (Representation, ModelForm, ComparisonError)  # older comparisons have no such table
 CURVES = "curves.csv"
 OF_ALL_LOADS = ("slices_by_load", "curves_by_load")
 """Stems of the figures under all loads."""
@@ -88,6 +92,9 @@ def read_tables(folder: Path) -> list[tuple[Any, ...]]:
     tables: list[tuple[Any, ...]] = []
     for name, kind in TABLES.items():
         readers = get_type_hints(kind)  # int, float or str
+        if kind in _LATER and not (folder / name).is_file():
+            tables.append(())
+            continue
         rows = _rows(folder / name, readers)
         with _damage_named(folder / name):
             tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))

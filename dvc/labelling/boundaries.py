@@ -77,11 +77,7 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
     grid, given, spacing = image.grid, labels.labels, image.grid.spacing_mm
     if not labels.grid.same_as(grid):
         raise InputError("The labels are on another grid than the image; resample them with `fit_mask`.")
-    names = labels.names.items()
-    bones = np.isin(given, [number for number, name in names if is_bones_name(name)])
-    skin = np.isin(given, [number for number, name in names if name.casefold() == "skin"])
-    if not (bones.any() or skin.any()):
-        raise InputError("No label is named skin, or like a bone, so there is no boundary to correct. Check the names.")
+    bones, skin = correctable(labels)
     watch(0.1)
     even, body, reach = fill_missing(without_bias_field(image)), given > 0, _REACH * float(spacing.mean())
     watch(0.2)
@@ -117,6 +113,16 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
     watch(1.0)
     changed = float(np.mean(corrected[body] != given[body]))
     return CorrectedLabels(LabelMap(grid, corrected, labels.names), changed, moved, tuple(notes))
+
+
+def correctable(labels: LabelMap) -> tuple[BoolArray, BoolArray]:
+    """Bones and skin, whose boundaries `correct_labels` corrects; InputError if no voxel is of either."""
+    names = labels.names.items()
+    bones = np.isin(labels.labels, [number for number, name in names if is_bones_name(name)])
+    skin = np.isin(labels.labels, [number for number, name in names if name.casefold() == "skin"])
+    if not (bones.any() or skin.any()):
+        raise InputError("No label is named skin, or like a bone, so there is no boundary to correct. Check the names.")
+    return bones, skin
 
 
 def _without_labels(image: Image, body: BoolArray, spacing_mm: FloatArray, reach_mm: float) -> BoolArray:

@@ -76,6 +76,12 @@ class Picture:
         return [(name, _small(png)) for name, png in self.beneath]
 
     @property
+    def alt(self) -> str:
+        """What it shows, for a person who does not see it: its title, and the first sentence of the caption."""
+        first = self.caption.partition(". ")[0].removesuffix(".")
+        return f"{self.title}: {first}." if first else self.title
+
+    @property
     def width(self) -> int:
         """Width on the page, CSS pixels."""
         return round(int.from_bytes(self.png[16:20], "big") * _CSS_PIXELS_PER_DOT)

@@ -166,7 +166,7 @@ def fit(
         typer.Option(help="Kind of test: uniaxial, equibiaxial or 'pure shear'. Default: the column test of the file."),
     ] = None,
     nu: Annotated[float, typer.Option(help="Poisson's ratio for simulations.")] = 0.4999,
-    tissue: Annotated[str, typer.Option(help="Region of the material in the material set that is written.")] = "fat",
+    tissue: Annotated[str, typer.Option(help="Tissue to which the written material set assigns the model.")] = "fat",
 ) -> None:
     """Fit a constitutive model to a stretch-stress curve, with 95 % intervals and the range of stability."""
     tell(mrstrain.fit(curve, law, out=out, test=test, nu=nu, tissue=tissue))

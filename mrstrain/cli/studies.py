@@ -44,7 +44,7 @@ def init(
         str, typer.Option(help="Name of the subject in the report; must not identify a patient.")
     ] = "Subject 01",
     yes: Annotated[
-        bool, typer.Option("--yes", help="Ask nothing. Nothing is asked outside a terminal, either.")
+        bool, typer.Option("--yes", help="Ask no questions. Outside a terminal, none are asked anyway.")
     ] = False,
 ) -> None:
     """Write a commented study file for the contents of a folder, and a picture of them.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import fe
 from dvc import Deformation, TetMesh
-from dvc.atomic_files import write_json, write_whole
+from dvc.atomic_files import whole_folder, write_json, write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import REGIONS, result_folders
 from dvc.threads import usable_cores
@@ -20,7 +20,8 @@ from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
-BOUNDARY, ENDING = "boundary", "-driven"  # folder of the boundary conditions for other codes; suffix of a set's folder
+ENDING = "-driven"  # of a set's folder
+_BOUNDARY = "boundary"  # folder in it, of the boundary conditions for other codes
 
 
 @door
@@ -37,9 +38,9 @@ def drive(
     dvc : path
         Results of `register` or `strain`: the folder with one folder per load, or the folder of one load.
     out : path
-        Gets a folder for each material set (SET-driven) with ``LOAD.vtu``, for `compare`, and a folder ``boundary``
-        with the displacements as boundary conditions for ANSYS, Abaqus and FEBio, with the node numbers, unit and frame
-        of the mesh.
+        Gets a folder for each material set (SET-driven) with ``LOAD.vtu``, for `compare`. Its folder ``boundary`` has
+        the displacements as boundary conditions for ANSYS, Abaqus and FEBio, with the node numbers, unit and frame of
+        the mesh.
     material, coordinates, progress
         As in `simulate`.
     loads : sequence of str
@@ -67,7 +68,7 @@ def drive(
     measured = {m.load: m.deformation() for m in measurements}
     prescribed = {load: boundary_displacement(read, field) for load, field in measured.items()}
     folders = {name: target / (name + ENDING) for name in laws}
-    refuse_touching_inputs(target, [BOUNDARY, *(f.name for f in folders.values())], [place, Path(dvc)])
+    refuse_touching_inputs(target, [f.name for f in folders.values()], [place, Path(dvc)])
     make_output(target)
     inputs = {"mesh": [place], "measured": [f for m in measurements for f in m.files]}
     inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
@@ -76,15 +77,15 @@ def drive(
     lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
     complete, regions = True, {str(n): region for n, region in enumerate(read.regions, start=1)}
     with ExitStack() as held_folders:
-        for folder in folders.values():  # not the boundary, which all sets of a study have in common
+        for folder in folders.values():  # a study drives its sets side by side
             make_output(folder)
             held_folders.enter_context(alone(folder))
-            fe.clear_simulation(folder)
-        make_output(target / BOUNDARY)
-        for load, (nodes, u) in prescribed.items():
-            write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=unit, frame=frame)
+            fe.begin_simulation(folder)
         for number, (name, (materials, notes)) in enumerate(laws.items()):
             tell("drive", "simulating", number / len(laws))
+            with whole_folder(folders[name] / _BOUNDARY) as conditions:
+                for load, (nodes, u) in prescribed.items():
+                    write_boundary_conditions(conditions / load, read, nodes, u, unit=unit, frame=frame)
             outcome, messages = _drive_set(folders[name], read, materials, measured, threads or usable_cores())
             complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
             lines += messages

@@ -128,6 +128,10 @@ def model_files(
         name, chosen = _chosen(place, loads)
         if twice := clash([*taken, name]):
             raise InputError(f"Two models are named {twice}; rename the folder of one of them.")
+        reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
+        if reached == {}:
+            notes.append(f"{name}: its simulation has not ended, or reached no load. Run it again.")
+            continue
         if not chosen:
             lacking = f"no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}"
             if len(models) == 1:
@@ -136,12 +140,11 @@ def model_files(
             continue
         taken.append(name)
         notes += _passed_over(name, chosen)
-        reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
         reading = _reading(place, usual, to_image)
         for load in loads:
             if load not in chosen:
                 notes.append(f"{name} has no result for {load}.")
-            elif reached.get(load, 0.0 if reached else 1.0) < 1.0:
+            elif reached is not None and reached.get(load, 0.0) < 1.0:
                 notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}; this load is not compared.")
             elif (end := early_end(chosen[load])) and end.certain and not usual.unfinished:
                 notes.append(
@@ -152,7 +155,7 @@ def model_files(
                 files[load].append(ModelFile(name, chosen[load], *reading))
                 if end:
                     notes.append(f"{name}: the run of {load} {end.reason}. Check that the load was reached.")
-                if stable.get(load, 1.0) < 1.0:
+                if stable is not None and stable.get(load, 1.0) < 1.0:
                     notes.append(
                         f"{name}, {load}: a material is not stable (Drucker) at the strain reached, in up to "
                         f"{1.0 - stable[load]:.1%} of a tissue. The model is compared, but do not trust its rank."
@@ -179,7 +182,7 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
             f"{place}: it is unclear for which load this result is. Name the file after a measured load "
             f"({', '.join(loads)}), or give the folder of one load as the measurement."
         )
-    if place.stem in _outcome(place, "reached"):
+    if place.stem in (_outcome(place, "reached") or ()):
         raise InputError(f"{place} is a simulation of {place.stem}, but the measured load is {loads[0]}.")
     return place.stem, {loads[0]: place}
 
@@ -208,20 +211,23 @@ def files_named(place: Path) -> list[Path]:
 
 def loads_of(place: Path, has_mesh: bool) -> list[str]:
     """Loads for which the folder of a model has a file: from mrstrain's simulation record, else from file names."""
-    if reached := _outcome(place, "reached"):
+    if (reached := _outcome(place, "reached")) is not None:
         return [load for load in reached if any((place / (load + ending)).is_file() for ending in ENDINGS)]
     kept = [ending for ending in ENDINGS if ending != ".csv" or has_mesh or (place / SETTINGS).is_file()]
     mesh = _reading(place, ModelReading())[0].model_mesh
     return sorted({p.stem for p in place.iterdir() if p.suffix.lower() in kept and p != mesh})
 
 
-def _outcome(place: Path, key: str) -> dict[str, float]:
-    """The fraction "reached" or "stable_share" by load, from mrstrain's simulation record; empty without one."""
+def _outcome(place: Path, key: str) -> dict[str, float] | None:
+    """The fraction "reached" or "stable_share" by load, from mrstrain's simulation record; None without one.
+
+    Empty while a simulation is under way, or if it was killed.
+    """
     try:
         outcome = read_json(_folder(place) / "simulation.json")["outcome"]
         return {load: float(of[key]) for load, of in outcome.items()}
     except (OSError, ValueError, KeyError, TypeError):
-        return {}
+        return None
 
 
 def _folder(place: Path) -> Path:

@@ -92,13 +92,17 @@ class Series:
     @classmethod
     def of(
         cls, out: Path, cases: tuple[Case, ...], failures: dict[str, str], record: Mapping[str, object],
-        more: Sequence[Section] = (),
+        first: Sequence[Section] = (), more: Sequence[Section] = (),
     ) -> Self:  # fmt: skip
-        """Write the provenance of a series and its report, one self-contained page with ``more`` at its end."""
+        """Write the provenance of a series and its report, one self-contained page.
+
+        It begins with the sections ``first``, if there are any, and the loads are then folded; ``more`` end it.
+        """
         told = [case.section for case in cases]
         told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]
         verdict = worst([s.verdict.among(s.title) if told[1:] else s.verdict for s in told if s.verdict is not None])
         write_json(out / PROVENANCE, record)
+        told = [*first, *(replace(section, folded=bool(first)) for section in told)]
         told += [replace(section, folded=True) for section in more]
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
         title, about = "Strain from MR image pairs", _images(record, cases)

@@ -1,8 +1,5 @@
 """A label map from a segmenter of the user's choice: a command that takes an image and writes a label map."""
 
-import os
-import subprocess
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,13 +9,12 @@ from dvc.errors import InputError, MrstrainError
 from dvc.report.drawing import Drawing
 from dvc.report.labels import tissue_slices
 from dvc.report.page import Section, Table
+from mrstrain.measurement.command import run_command
 from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volumes_ml
 from mrstrain.options.measurement import IMAGE, LABELS, command_parts
 from mrstrain.records.provenance import provenance
 
-_ONE_THREAD = {"OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"}
-"""Variables by which the stages of a study keep to a core each."""
-_TOLD_EVERY_S, _HALF_S = 5.0, 120.0  # how long a command takes is not known
+_HALF_S = 120.0  # how long a command takes is not known
 _SHOWN = 3  # last lines of what a command printed
 
 
@@ -85,34 +81,16 @@ def _run(command: str, image: Path, labels: Path, watch: Callable[[float], None]
     place = image.resolve().parent
     given = [part.replace(IMAGE, str(image.resolve())).replace(LABELS, str(labels.resolve())) for part in parts]
     try:
-        code, said = _watched(given, place, watch)
+        code, said = run_command(given, place, lambda spent: watch(spent / (spent + _HALF_S)))
     except OSError as failure:
         what = f"labels_command: {parts[0]} cannot be run ({failure.strerror or failure})"
         raise MrstrainError(f"{what}. Install it, or give its whole path.") from failure
+    if code < 0:
+        raise MrstrainError(_failed(f"signal {-code} ended it, most often for lack of memory", command, said))
     if code != 0:
         raise MrstrainError(_failed(f"it ended with status {code}", command, said))
     if not labels.is_file():
         raise MrstrainError(_failed(f"it wrote no file in place of {LABELS}", command, said))
-
-
-def _watched(given: Sequence[str], place: Path, watch: Callable[[float], None]) -> tuple[int, str]:
-    """Status of a command, and what it printed; it may use all cores, and ends with this block."""
-    free = {name: value for name, value in os.environ.items() if name not in _ONE_THREAD}
-    began, both = time.monotonic(), subprocess.STDOUT
-    with subprocess.Popen(
-        given, cwd=place, env=free, stdout=subprocess.PIPE, stderr=both, text=True, errors="replace"
-    ) as running:  # fmt: skip
-        try:
-            while True:
-                try:
-                    said, _ = running.communicate(timeout=_TOLD_EVERY_S)
-                    return running.returncode, said
-                except subprocess.TimeoutExpired:
-                    spent = time.monotonic() - began
-                    watch(spent / (spent + _HALF_S))
-        except BaseException:
-            running.kill()
-            raise
 
 
 def _failed(what: str, command: str, said: str) -> str:

@@ -20,9 +20,9 @@ from dvc.report.page import Section
 from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
+from mrstrain.measurement.answer import measured_strain
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.label import label
 from mrstrain.measurement.plan import Plan, record_of
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
@@ -137,7 +137,9 @@ def register(
             _hold(target, stack)
         run.all(at_once, registration.chain, first)
         finished = run.finished()
-    return Series.of(target, finished, run.failures, record, of_labels)
+    shown = [case for case in finished if case.name != REPEAT]
+    answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
+    return Series.of(target, finished, run.failures, record, answer, of_labels)
 
 
 def _hold(out: Path, stack: ExitStack) -> None:
@@ -163,6 +165,8 @@ def _labelled(
     load0: Path, files: SubjectFiles, out: Path, tell: Callable[[float], None]
 ) -> tuple[SubjectFiles, tuple[Section, ...]]:
     """Make the label map; the files with it, and its section of the report."""
+    from mrstrain.measurement.label import label  # with it come skimage.restoration and scipy.stats: 0.7 s
+
     labels, names = made_labels(out)
     tell(0.0)
     made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, watch=tell)

@@ -5,6 +5,7 @@ from pathlib import Path
 import dvc
 from dvc import Deformation, read_displacement, read_transform
 from dvc.errors import InputError
+from mrstrain.measurement.answer import measured_strain
 from mrstrain.measurement.case import Case, Series
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
@@ -64,4 +65,6 @@ def strain(
     measured = dvc.Measurement.from_deformation(total, subject, name=name)
     make_output(target)
     with alone(target):
-        return Series.of(target, (Case.of(measured, target / name, record),), {}, record)
+        case = Case.of(measured, target / name, record)
+        first = measured_strain([case.section], subject, {name: case.folder}, target)
+        return Series.of(target, (case,), {}, record, first)

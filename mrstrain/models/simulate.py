@@ -133,7 +133,7 @@ def simulate(
 
 def _remove_earlier(folder: Path, loads: Collection[str]) -> None:
     """Remove the results of an earlier simulation; checkpoints of the current loads are kept."""
-    fe.clear_simulation(folder)
+    fe.begin_simulation(folder)
     remove_partial(folder)
     for left in folder.glob(f"*{ENDING}"):
         if left.name.removesuffix(ENDING) not in loads:

@@ -70,7 +70,7 @@ class SubjectFiles(BoneAndBody):
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
-    """Label map of the tissues on the unloaded image. register takes auto: made from the image and --bone."""
+    """Label map of the tissues on the unloaded image. With register, auto makes it from the image and --bone."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
 

@@ -172,7 +172,7 @@ class ModelReading(Options):
     model_frame: Frame = "LPS"
     """Frame of the model coordinates."""
     unfinished: Flag = False
-    """Compare results of FEBio and CalculiX whose run ended early, too."""
+    """Also compare results of FEBio and CalculiX whose run ended early."""
 
 
 def _rising(strains: tuple[float, float]) -> tuple[float, float]:

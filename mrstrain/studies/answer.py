@@ -5,33 +5,35 @@ from dataclasses import replace
 from pathlib import Path
 
 from dvc.errors import InputError
-from dvc.report.page import Section, Table
+from dvc.report.page import Picture, Section
+from mrstrain.measurement.answer import table_of_loads
 from validate import NOTHING, Comparison
 
-_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration, with the 95 % confidence interval in brackets."
 _NEAREST = (
     " Best match: smallest area between the strain-volume curves of model and measurement in that tissue. A dash: no "
     "model is better than zero strain everywhere."
 )
 
 
-def answer_of(measured: Sequence[Section], compared: Sequence[Section], folder: Path) -> list[Section]:
+def answer_of(
+    measured: Sequence[Section], compared: Sequence[Section], folder: Path, pictures: Sequence[Picture] = ()
+) -> list[Section]:
     """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
 
-    Its table has a row for each load and tissue: the measured maximum shear strain, and the best match.
+    Its table has a row for each load and tissue: the measured maximum shear strain, and the best match. Without a
+    comparison it has ``pictures`` of the measured strain.
     """
-    tables = [(section.title, section.summary) for section in measured if section.summary is not None]
-    if not tables:
+    table = table_of_loads(measured)
+    if not compared:
+        first = Section("Measured strain", pictures=tuple(pictures), pictures_first=True)
+        return [] if table is None else [replace(first, tables=(table,))]
+    if table is None:
         return list(compared)
-    nearest = _nearest(folder) if compared else {}
-    model = ("best match",) if compared else ()
-    rows = [
-        (load, *row, *(nearest.get((load, str(row[0])), "–") for _ in model)) for load, of in tables for row in of.rows
-    ]
-    columns = ("load", *tables[0][1].columns, *model)
-    table = Table("Measured maximum shear strain", columns, tuple(rows), _NOTE + _NEAREST * bool(compared))
-    first = compared[0] if compared else Section("Measured strain")
-    return [replace(first, tables=(table, *first.tables))]
+    nearest = _nearest(folder)
+    rows = tuple((*row, nearest.get((str(row[0]), str(row[1])), "–")) for row in table.rows)
+    columns = (*table.columns, "best match")
+    first_table = replace(table, columns=columns, rows=rows, note=table.note + _NEAREST)
+    return [replace(compared[0], tables=(first_table, *compared[0].tables))]
 
 
 def _nearest(folder: Path) -> dict[tuple[str, str], str]:

@@ -12,6 +12,7 @@ from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_im
 from dvc.errors import MrstrainError
 from dvc.io.images.labels import read_names
 from dvc.io.result_folder import REPEAT
+from dvc.labelling.boundaries import correctable
 from dvc.labelling.tissues import NAMES
 from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.threads import usable_cores
@@ -101,12 +102,15 @@ class _Look:
                 self.wrong.append(str(error))
             return None
 
-    def tried_at(self, table: str, key: str, read: Callable[_P, object], *given: _P.args, **options: _P.kwargs) -> None:
+    def tried_at(
+        self, table: str, key: str, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs
+    ) -> _T | None:  # fmt: skip
         """As `tried`, for a value whose line in the study file is reported."""
         try:
-            read(*given, **options)
+            return read(*given, **options)
         except MrstrainError as error:
             self.wrong.append(f"{self.study.at(table, key)}: {error}")
+            return None
 
     def asked(self, *names_or_kinds: str) -> bool:
         """Whether a stage of one of these names or kinds is checked."""
@@ -163,7 +167,16 @@ class _Look:
             self.notes.append(f"Labels: {', '.join(labels.names.values())}")
             if reference is not None:
                 labels = self.tried(fit_mask, labels, reference.grid, str(self.study.images.labels)) or labels
+            if self.study.images.correct_labels:
+                self.at_correction(labels)
         return labels
+
+    def at_correction(self, labels: LabelMap) -> None:
+        """Report labels of which `correct_labels` has no boundary to correct, or that of bones or skin alone."""
+        there = self.tried_at("images", "correct_labels", correctable, labels)
+        for lacking, name in zip(there or (), ("like a bone", "skin"), strict=False):
+            if not lacking.any():
+                self.notes.append(f"WARNING: no label is named {name}, so correct_labels leaves its boundary.")
 
     def at_marks(self, reference: Image | None) -> None:
         """Check the marks for the label map, among which the bone must be if there is no mask of it."""

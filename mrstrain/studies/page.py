@@ -6,11 +6,16 @@ from pathlib import Path
 
 from dvc import Verdict
 from dvc.atomic_files import write_json
+from dvc.errors import MrstrainError
 from dvc.io.result_folder import PROVENANCE
 from dvc.measurement.page import STRAIN
+from dvc.measurement.side_by_side import FIGURE, measured_by_load
 from dvc.report.page import METHODS, Picture, Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.comparison.methods import methods_of_registrations
+from mrstrain.options.measurement import MeshAndAxes
+from mrstrain.options.modelling import Directions
+from mrstrain.records.inputs import read_subject
 from mrstrain.records.provenance import provenance, without_folders
 from mrstrain.studies.answer import answer_of
 from mrstrain.studies.file import Study
@@ -41,7 +46,8 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     write_json(path.with_name(PROVENANCE), record | {"stages": stages})
     against_truth = error_against_truth(study, outcomes)
     of_each = [section for of in of_loads.values() for section in of.sections if section.title in study.loads]
-    answer = answer_of(of_each, compared[:1], study.out / COMPARISON)
+    pictures = [] if compared else _side_by_side(study, outcomes)
+    answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures)
     others = [*against_truth, *compared[1:], *registered, *labelled, _stages(outcomes)]
     sections = [*answer, *(replace(section, folded=True) for section in others)]
     verdict = _verdict(
@@ -68,7 +74,7 @@ def write_page_in_progress(
     of_loads = [section for one in measured for section in one.result.sections]
     pictures = tuple(picture for section in of_loads for picture in _strain(section))
     sections = [
-        *(replace(one, pictures=pictures, pictures_first=True) for one in answer_of(of_loads, (), study.out)),
+        *answer_of(of_loads, (), study.out, pictures),
         Section("Progress", None, (Table("Stages", ("stage", "state", "what it found"), tuple(rows)),)),
     ]
     write_report(path, study.study.name, None, sections, (), {}, notes=[told], reload_s=None if ended else _RELOAD_S)
@@ -82,6 +88,23 @@ def _strain(section: Section) -> list[Picture]:
     """The picture of a load's strain, called as the load, with the verdict, and without those beneath it."""
     title = section.title if section.verdict is None else f"{section.title}: {section.verdict.words}"
     return [replace(one, title=title, beneath=()) for one in section.pictures if one.title == STRAIN]
+
+
+def _side_by_side(study: Study, outcomes: Mapping[str, StageOutcome]) -> list[Picture]:
+    """The picture of the measured strain of all loads; none if a file that it is drawn from is no longer there."""
+    place = study.out / REGISTRATION
+    measured = {load: place / load for load in study.loads if outcomes[f"register {load}"].record is not None}
+    if not measured:
+        return []
+    try:
+        onto = study.plate.narrowed(Directions)
+        subject = read_subject(
+            study.path(study.images.load0), study.subject_files, MeshAndAxes(**onto.model_dump()),
+            allow_missing=study.images.allow_missing,
+        )  # fmt: skip
+        return [measured_by_load(subject, measured).save(place / FIGURE)]
+    except MrstrainError:
+        return []
 
 
 def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdict | None:

@@ -22,6 +22,7 @@ from validate import ALL, Comparison, Criteria, InputError, compare, compare_loa
 from validate.report import area_rows, load_sections
 from validate.tables import read_curves
 
+ROWS = ("areas", "overlaps", "agreements", "skin", "representations", "model_forms")
 GAMMAS = {"half": 0.2, "double": 0.8}
 
 
@@ -50,7 +51,7 @@ def test_loads_compared_in_processes_give_the_same_to_the_bit(comparison: Compar
         cases, by = [one.case for one in comparison.loads], comparison.loads[0].criteria
         again = compare(cases, labels(), criteria=by, notes=["half is linear."], each=each)
         again.write(tmp_path / "again", on_image=True, each=each)
-    for rows in ("areas", "overlaps", "agreements", "skin"):
+    for rows in ROWS:
         assert repr(getattr(again, rows)) == repr(getattr(comparison, rows))
     assert again.loads[0].labels is again.loads[1].labels
     written = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
@@ -61,7 +62,7 @@ def test_loads_compared_in_processes_give_the_same_to_the_bit(comparison: Compar
 
 def test_what_is_read_back_is_what_was_written(comparison: Comparison, folder: Path) -> None:
     back = Comparison.read(folder)
-    for rows in ("areas", "overlaps", "agreements", "skin"):
+    for rows in ROWS:
         ours, theirs = getattr(comparison, rows), getattr(back, rows)
         assert len(ours) == len(theirs) > 0
         for one, other in zip(ours, theirs, strict=True):

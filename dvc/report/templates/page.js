@@ -21,3 +21,9 @@ document.querySelectorAll(".faders").forEach((faders) => {
     over[number].style.opacity = fader.value / 100;
   }));
 });
+/* On a narrow screen a picture fits it, or is large in a box of its own that scrolls. */
+document.querySelectorAll(".enlarge").forEach((button) => button.addEventListener("click", () => {
+  const picture = button.parentElement.querySelector(".stack"), large = picture.classList.toggle("large");
+  picture.tabIndex = large ? 0 : -1;
+  button.textContent = large ? "Show the whole picture" : "Enlarge the picture";
+}));

@@ -56,6 +56,11 @@ UNNAMED = """[
   ...[...document.querySelectorAll("button, summary, a")].filter((one) => !one.textContent.trim()),
   ...[...document.querySelectorAll("th")].filter((one) => !one.scope),
 ].map((one) => one.outerHTML.slice(0, 80))"""
+CUT_OFF = """[...document.querySelectorAll("figure img")].filter((one) => one.checkVisibility()).map((one) => {
+  const seen = one.closest("figure").getBoundingClientRect(), whole = one.getBoundingClientRect();
+  return Math.max(seen.left - whole.left, whole.right - seen.right, whole.right - innerWidth);
+}).filter((pixels) => pixels > 0.5)"""
+"""Pixels by which pictures are wider than their figure, or than the window."""
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
 
 
@@ -101,6 +106,7 @@ def test_the_page_fits_and_its_text_is_legible(tab: Tab, page: Path, width: int,
     assert tab.value("document.getElementById('contents').open") == (width > 1088)  # the answer comes first
     tab.value(UNFOLD)
     assert tab.value(TOO_WIDE) <= 0
+    assert tab.value(CUT_OFF) == []
     assert tab.value(PALE) == []
     shot = base64.b64decode(tab.call("Page.captureScreenshot", captureBeyondViewport=True)["data"])
     (tmp_path / f"report-{width}.png").write_bytes(shot)  # to be looked at
@@ -117,6 +123,23 @@ def test_what_does_not_fit_or_is_pale_is_found(tab: Tab, page: Path) -> None:
     assert pale.startswith("A note.: contrast 3.")
 
 
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_picture_is_seen_whole_and_can_be_enlarged_on_a_telephone(tab: Tab, page: Path, width: int) -> None:
+    opened(tab, page, width)
+    button, box = ("document.querySelector('.enlarge')", "document.querySelector('.stack')")
+    assert tab.value(f"{button}.checkVisibility()") == (width == 400)
+    tab.value(f"{button}.click()")
+    if width == 400:  # it scrolls in its own box, by touch and by keys; the page does not
+        assert tab.value(f"{box}.scrollWidth > 1.5 * {box}.clientWidth")
+        assert tab.value(f"{box}.tabIndex") == 0
+    assert tab.value(TOO_WIDE) <= 0
+    assert tab.value(f"{button}.textContent") == "Show the whole picture"
+    tab.value(f"{button}.click()")
+    assert tab.value(f"{button}.textContent") == "Enlarge the picture"
+    assert tab.value(CUT_OFF) == []
+    assert tab.said == []
+
+
 def test_a_screen_reader_finds_its_way(tab: Tab, page: Path) -> None:
     opened(tab, page, 1400)
     tab.value(UNFOLD)
@@ -125,6 +148,11 @@ def test_a_screen_reader_finds_its_way(tab: Tab, page: Path) -> None:
     assert levels[0] == 1
     assert all(below - above <= 1 for above, below in pairwise(levels))
     assert tab.value(UNNAMED) == []
+    assert tab.value("[...document.querySelectorAll('.stack img')].map((one) => one.alt)") == [
+        "Load1, unloaded: the same slices of the image, without colours.",
+        "Load1, Load1, registered: the same slices of the image, without colours.",
+        "Load1, Strain: How to read it.",
+    ]
     assert tab.value("document.documentElement.lang") == "en"
     assert tab.value("document.querySelectorAll('main, nav[aria-label]').length") == 2
 

@@ -106,6 +106,19 @@ def test_the_report_says_which_images_it_is_about(results, study, tiny_pair):
     assert re.search(rf"<p>Images: [^<]*Load0[^<]*, [^<]*Load1[^<]*\. Maps of {voxels}\.</p>", page)
 
 
+def test_the_report_begins_with_the_strain_of_the_loads_in_a_picture(results, study):
+    first, *others = (study / "out" / "report.html").read_text().split('<details id="part-')[1:]
+    assert "<h2>Measured strain</h2>" in first
+    figure, table = first.index("<figure>"), first.index("<table>")
+    assert figure < table  # the picture comes first, and is that of Load1 without the repeat scan
+    assert "<td>fat</td>" in first
+    assert "<th scope=row>Load1</th>" in first
+    assert "repeat" not in first
+    assert not any(part.split(">", 1)[0].endswith("open") for part in others)
+    for ending in ("png", "pdf"):
+        assert (study / "out" / f"slices_by_load.{ending}").stat().st_size > 0
+
+
 def test_error_bars_are_those_of_the_model(results, study, tiny_pair):
     folder = study / "out" / "Load1"
     shear = read_image(folder / "max_shear.nii.gz", allow_missing=True).values

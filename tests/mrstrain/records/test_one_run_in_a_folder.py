@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import SimpleITK as sitk
 from filelock import FileLock
 
 import mrstrain
@@ -22,23 +21,6 @@ NAMED = {"labels": LABELS, "names": GIVEN / "tissues.csv"}
 SUBJECT = {**NAMED, "bone_label": "bone"}
 OWN, SET, MODEL = str(GIVEN / "materials.toml"), "two-laws", "two-laws-driven"
 TOUCHING = LoadStep("Load1", 2.0)
-CURVE = "test,stretch,nominal_stress_kpa\n" + "".join(f"uniaxial,{1 - n / 50},{-n / 20}\n" for n in range(20))
-
-
-@pytest.fixture(scope="module")
-def made(made_once: Callable[..., Path]) -> Path:
-    """What the commands are given beside the golden inputs: a stretch, its strain, a model driven by it ..."""
-
-    def fill(folder: Path) -> None:
-        stretched = sitk.AffineTransform((1.01, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.99), (0.0, 0.0, 0.0))
-        sitk.WriteTransform(stretched, str(folder / "Load1.tfm"))
-        mrstrain.strain(LOAD0, folder / "Load1.tfm", out=folder / "strain", **SUBJECT)
-        mrstrain.drive(PAD, folder / "strain", out=folder, sets=[OWN], threads=1)
-        (folder / "curve.csv").write_text(CURVE)
-        labels = sitk.ReadImage(str(LABELS))
-        sitk.WriteImage(sitk.Cast(labels == 1, sitk.sitkUInt8), str(folder / "bone.nii.gz"))
-
-    return made_once("one-run-in-a-folder", fill)
 
 
 LOCK = ".mrstrain-lock"
@@ -96,6 +78,10 @@ def test_the_sets_of_a_study_are_driven_side_by_side(made: Path, tmp_path: Path)
     with FileLock(tmp_path / "akrami-driven" / ".mrstrain-lock"):
         assert COMMANDS["drive"][1](made, tmp_path).complete
     assert not [*tmp_path.rglob("two-laws-driven/.*")]
+    written = {path.relative_to(tmp_path).parts[0] for path in tmp_path.rglob("*") if path.is_file()}
+    assert written <= {MODEL, "akrami-driven"}, "a file in a folder that another run does not know to be held"
+    conditions = {path.name for path in (tmp_path / MODEL / "boundary").iterdir()}
+    assert conditions == {"Load1.inp", "Load1.mac", "Load1.feb"}
 
 
 def test_the_loads_of_a_model_are_levelled_side_by_side(

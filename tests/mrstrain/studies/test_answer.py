@@ -49,6 +49,12 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
     )
 
 
+def test_intervals_are_told_of_only_where_there_are_any(tmp_path: Path) -> None:
+    without = Section("Load1", summary=summary_table([BONE, FAT], []))
+    notes = [answer_of([one], [], tmp_path)[0].tables[0].note for one in (section("Load1"), without)]
+    assert ["95 %" in note for note in notes] == [True, False]
+
+
 def test_registrations_alone_and_a_comparison_alone_are_shown_too(folder: Path, tmp_path: Path) -> None:
     (first,) = answer_of([section("Load1")], [], folder)
     assert first.tables[0].columns == ("load", "tissue", "median", "95th percentile")

@@ -56,6 +56,14 @@ def test_the_label_map_is_made_and_measured_with(study):
     assert f"{100 * unsure:.0f} % of its voxels are unsure" in page
 
 
+def test_a_study_without_models_begins_with_the_strain_in_a_picture(study):
+    first = (study / "results" / "report.html").read_text().split('<details id="part-')[1]
+    assert "<h2>Measured strain</h2>" in first
+    assert first.index("<figure>") < first.index("<table>")
+    assert "Sagittal" in first
+    assert (study / "results" / "registration" / "slices_by_load.png").stat().st_size > 0
+
+
 def test_only_what_another_mask_changes_is_done_anew(study, tiny_pair):
     assert set(forecast(study).values()) == {"done already"}
     smaller = Mask(tiny_pair.bone.grid, binary_erosion(tiny_pair.bone.inside))

@@ -123,6 +123,21 @@ def test_labels_that_are_made_later_are_checked_by_what_they_are_made_from(study
     assert "strokes.nii.gz" in wrong(study, named, ('"mine.toml", ', ""))
 
 
+def test_labels_without_a_boundary_to_correct_are_told(study):
+    asked = ('names = "tissues.csv"', 'names = "tissues.csv"\ncorrect_labels = true')
+    assert wrong(study, asked, ('"mine.toml", ', "")) == ""
+    told = [note for note in check(study).notes if "correct_labels" in note]
+    assert told == ["WARNING: no label is named skin, so correct_labels leaves its boundary."]
+    values = np.ones(GRID.shape, dtype=np.int64)
+    values[:4] = 2
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "heel"}))
+    assert "line 8: [images] 'correct_labels': No label is named skin, or like a bone" in wrong(study, asked)
+    values[:2] = 3
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "heel", 3: "skin"}))
+    assert "correct_labels" not in wrong(study, asked)
+    assert "WARNING: no label is named like a bone, so correct_labels" in "\n".join(check(study).notes)
+
+
 def test_a_plate_without_friction_carries_no_shear(study):
     write_tet_mesh(study / "dome.vtu", dome((3, 4, 4)), {})
     for mesh in ("[mesh]", '[mesh]\nfile = "dome.vtu"'):

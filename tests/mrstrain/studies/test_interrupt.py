@@ -141,7 +141,7 @@ def simulating(images: Path, folder: Path) -> Case:
     plate = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0", "--workers", "1", "--set", "luboz"]
     command = ["simulate", str(folder / "dome.vtu"), *loads, *plate, "--out", str(folder / "out")]
     out = folder / "out" / "luboz"
-    return Case(command, lambda _: (out / "Load0.vtu").is_file(), out / "Load0.restart.npz", out / "simulation.json")
+    return Case(command, lambda _: (out / "Load0.vtu").is_file(), out / "Load0.restart.npz", out / "regions.csv")
 
 
 def meshing(images: Path, folder: Path) -> Case:

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
+import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dvc import read_labels, write_image, write_labels
+from dvc import Grid, LabelMap, read_image, read_labels, write_image, write_labels
 from dvc.errors import InputError, MrstrainError
+from mrstrain.measurement.command import run_command
 from mrstrain.measurement.label_command import labelled_by_command
 from mrstrain.studies.check import check
 from mrstrain.studies.file import read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.plan import plan
+from tests.mrstrain.studies.test_interrupt import OVER_S
+from tests.processes import is_gone, wait_for
 
 SEGMENTER = """
 import shutil, sys
@@ -67,22 +75,33 @@ def test_what_the_command_writes_is_the_label_map(folder, tiny_pair):
         ("'{python}' -c 'import sys; sys.exit(\"no GPU\")' {image} {labels}", "status 1"),
         ("'{python}' -c 'import sys; sys.exit(\"no GPU\")' {image} {labels}", "no GPU"),
         ("'{python}' -c 'print(1)' {image} {labels}", "it wrote no file in place of {labels}"),
+        ("'{python}' -c 'import os; os.kill(os.getpid(), 9)' {image} {labels}", "signal 9 ended it, most often for"),
+        ("'{python}' -c 'input()' {image} {labels}", "EOFError"),
+        ("'{python}' copy.py empty.nii.gz {labels} {image}", "empty"),
+        ("'{python}' copy.py elsewhere.nii.gz {labels} {image}", "only 0% of its volume is inside the image"),
+        ("'{python}' copy.py segment.py {labels} {image}", "_of_command.nii.gz"),
         ("segment {image}", "the command needs {labels} where it takes the label map"),
         ("segment '{image} {labels}", "No closing quotation"),
     ],
 )
 def test_a_command_that_fails_is_told_and_leaves_nothing(folder, command, told):
-    command = command.replace("{python}", sys.executable)
+    command, drawn = command.replace("{python}", sys.executable), read_labels(folder / "drawn.nii.gz")
+    (folder / "copy.py").write_text("import shutil, sys\nshutil.copy(*sys.argv[1:3])\n")
+    grid = drawn.grid
+    elsewhere = Grid(grid.shape, grid.spacing_mm, grid.origin_mm + 500.0)
+    write_labels(folder / "elsewhere.nii.gz", LabelMap(elsewhere, drawn.labels, drawn.names))
+    write_labels(folder / "empty.nii.gz", LabelMap(grid, np.zeros_like(drawn.labels), drawn.names))
     with pytest.raises(MrstrainError, match=re.escape(told)):
         labelled_by_command(folder / "Load0.nii.gz", command, None, folder / "results" / "tissues.nii.gz")
     assert not (folder / "results").exists()
 
 
 def test_a_long_command_is_told_to_go_on_and_may_use_all_cores(folder, monkeypatch):
-    monkeypatch.setattr("mrstrain.measurement.label_command._TOLD_EVERY_S", 0.05)
+    monkeypatch.setattr("mrstrain.measurement.command._LOOK_EVERY_S", 0.05)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     (folder / "slow.py").write_text(
-        "import os, shutil, sys, time\ntime.sleep(1.0)\nassert 'OMP_NUM_THREADS' not in os.environ\n"
+        "import os, shutil, sys, time\nassert 'OMP_NUM_THREADS' not in os.environ\n"
+        "while time.process_time() < 1.0: pass\n"
         "shutil.copy('drawn.nii.gz', sys.argv[1])\n"
     )
     told, command = list[float](), f"'{sys.executable}' slow.py {{labels}} {{image}}"
@@ -91,6 +110,44 @@ def test_a_long_command_is_told_to_go_on_and_may_use_all_cores(folder, monkeypat
     assert len(told) > 4
     assert told == sorted(told)
     assert told[-1] == 1.0
+
+
+def test_a_command_that_hangs_is_not_told_to_go_on(tmp_path, monkeypatch):
+    """So the study names it after ten minutes, and ends it after an hour."""
+    monkeypatch.setattr("mrstrain.measurement.command._LOOK_EVERY_S", 1.0)
+    told = list[float]()
+    run_command([sys.executable, "-S", "-c", "import time; time.sleep(6.0)"], tmp_path, told.append)
+    assert len(told) <= 2  # while it starts
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+def test_what_a_command_leaves_behind_is_ended(tmp_path):
+    """Also where that holds the command's output open, and does not listen."""
+    (tmp_path / "stays.sh").write_text("trap '' TERM\necho $$ > left\nexec sleep 1000\n")
+    began = time.monotonic()
+    assert run_command(["sh", "-c", "sh stays.sh & sleep 1; echo done"], tmp_path, lambda _: None) == (0, "done\n")
+    assert time.monotonic() - began < 60.0
+    assert is_gone(int((tmp_path / "left").read_text()))
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
+def test_a_study_that_is_ended_leaves_no_segmenter(folder, by):
+    segmenter = "sh -c 'sleep 1000 & echo $! $$ > processes; sleep 1000' {image} {labels}"
+    write_image(folder / "Load1.nii.gz", read_image(folder / "Load0.nii.gz"))
+    (folder / "study.toml").write_text(STUDY.replace("segment {image} {labels}", segmenter))
+    command = [sys.executable, "-m", "mrstrain", "run", str(folder), "--only", "label", "--no-open"]
+    study, begun = subprocess.Popen(command, start_new_session=True), folder / "processes"
+    try:
+        wait_for(lambda: begun.is_file() and len(begun.read_text().split()) == 2, study)
+        os.killpg(study.pid, by)
+        began, below = time.monotonic(), [int(one) for one in begun.read_text().split()]
+        wait_for(lambda: all(map(is_gone, below)), limit_s=OVER_S)
+        print(f"over after {time.monotonic() - began:.1f} s")
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(study.pid, signal.SIGKILL)
+        study.wait()
 
 
 def test_a_study_runs_it_as_its_first_stage(folder):

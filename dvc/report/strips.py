@@ -1,0 +1,95 @@
+"""Strain in one slice of the image under every load: the first figure of a report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.report.chart import colour_bar, empty
+from dvc.report.figures import MAX_SHEAR
+from dvc.report.sheet import LETTERS, Plane, name_sides, outline, scale_bar, slice_panel
+from dvc.report.style import FONT, INK, ON_DARK, WIDTH_IN
+
+MEASURED = "measured"
+_GAP_IN, _HEAD_IN, _SIDE_IN, _FOOT_IN, _TALLEST_IN = 0.06, 0.3, 0.3, 0.62, 3.2
+_COLOURS = colormaps["viridis"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Strip:
+    """A slice of one load: the image, outlines, and the measured and simulated max. shear on its voxels."""
+
+    load: str
+    plane: Plane
+    extent_mm: tuple[float, float, float, float]
+    title: str
+    place: str  # that the slice goes through, in words
+    image: FloatArray  # rows downward, columns to the right; 0 to 1
+    outlines: tuple[BoolArray, ...]
+    max_shear: Mapping[str, Float32Array]  # by model, and of `MEASURED`; NaN where undefined
+
+
+def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
+    """Maximum shear strain in one slice of the unloaded anatomy under each load.
+
+    On the left, the unloaded image. White lines are the surfaces of the body and of the bones. The image is grey where
+    strain is not defined. The colour bar ends at the 98th percentile of all that is shown, rounded up to 0.05.
+    """
+    # A row for each name; they are those of `Strip.max_shear`.
+    first, many = strips[0], len(rows) > 1
+    left, right, bottom, top = first.extent_mm
+    width_mm, height_mm = right - left, abs(top - bottom)
+    aside_in = _HEAD_IN + _SIDE_IN if many else _GAP_IN  # between the unloaded image and the rows, for their names
+    columns = len(strips) + 1
+    inches = min(((WIDTH_IN - aside_in) / columns - _GAP_IN) / width_mm, _TALLEST_IN / height_mm)
+    w, h = inches * width_mm, inches * height_mm
+    size = aside_in + columns * (w + _GAP_IN), _HEAD_IN + len(rows) * (h + _GAP_IN) + _FOOT_IN
+    figure, norm = empty(size), Normalize(0.0, _highest(strips, rows))
+    middle = _FOOT_IN + (len(rows) - 1) * (h + _GAP_IN) / 2
+    unloaded = slice_panel(figure, (0.0, middle / size[1], w / size[0], h / size[1]))
+    _paint(unloaded, first, None, norm)
+    unloaded.set_title("Load0", color=INK, pad=4, **FONT)
+    name_sides(unloaded, LETTERS[first.plane], **ON_DARK)
+    scale_bar(unloaded, width_mm, **ON_DARK)
+    for row, name in enumerate(rows):
+        low = _FOOT_IN + (len(rows) - 1 - row) * (h + _GAP_IN)
+        if many:
+            at = (w + _HEAD_IN + 0.12) / size[0], (low + h / 2) / size[1]
+            figure.text(*at, name, rotation=90, va="center", color=INK, **FONT)
+        for column, strip in enumerate(strips):
+            box = (w + aside_in + column * (w + _GAP_IN)) / size[0], low / size[1], w / size[0], h / size[1]
+            axes = slice_panel(figure, box)
+            _paint(axes, strip, name, norm)
+            if row == 0:
+                axes.set_title(strip.load, color=INK, pad=4, **FONT)
+    length = min(4.2, 0.6 * size[0])
+    bar = figure.add_axes(((size[0] - length) / 2 / size[0], 0.42 / size[1], length / size[0], 0.12 / size[1]))
+    colour_bar(bar, ScalarMappable(norm, _COLOURS), MAX_SHEAR, "max")
+    return figure
+
+
+def _highest(strips: Sequence[Strip], rows: Sequence[str]) -> float:
+    """Upper end of the colours: the 98th percentile of all that is drawn, rounded up to 0.05; at least 0.1."""
+    pages = [strip.max_shear[name] for strip in strips for name in rows if name in strip.max_shear]
+    known = np.concatenate([page[np.isfinite(page)] for page in pages]).astype(np.float64)
+    return max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
+
+
+def _paint(axes: Axes, strip: Strip, name: str | None, norm: Normalize) -> None:
+    """Draw a slice of the unloaded image, with the strain that was measured or that a model gives, if one is named."""
+    how: dict[str, Any] = {"extent": strip.extent_mm, "origin": "upper", "aspect": "auto"}
+    axes.imshow(strip.image, cmap="gray", vmin=0.0, vmax=1.0, **how)
+    values: npt.NDArray[Any] | None = None if name is None else strip.max_shear.get(name)
+    if values is None and name is not None:
+        axes.text(0.5, 0.5, "no result", transform=axes.transAxes, ha="center", **ON_DARK, **FONT)
+    elif values is not None:
+        axes.imshow(np.ma.masked_invalid(values), cmap=_COLOURS, norm=norm, interpolation="nearest", **how)
+    outline(axes, strip.extent_mm, strip.outlines)

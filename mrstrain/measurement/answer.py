@@ -1,0 +1,37 @@
+"""The first part of a report on measurements: the strain of every load in one slice, and by tissue in a table."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from dvc import Subject
+from dvc.report.page import Section, Table
+
+_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
+_INTERVALS = ", with the 95 % confidence interval in brackets"
+
+
+def measured_strain(
+    measured: Sequence[Section], subject: Subject, folders: Mapping[str, Path], out: Path
+) -> list[Section]:
+    """The first part of a report, from the sections of the loads; its figure is also written into ``out``.
+
+    ``folders`` are those of the loads' results, by load; empty if there is none, and so nothing to show.
+    """
+    if not folders:
+        return []
+    from dvc.measurement.side_by_side import FIGURE, measured_by_load  # it draws, and matplotlib takes half a second
+
+    picture = measured_by_load(subject, folders).save(out / FIGURE)
+    table = table_of_loads(measured)
+    tables = () if table is None else (table,)
+    return [Section("Measured strain", None, tables, (picture,), pictures_first=True)]
+
+
+def table_of_loads(measured: Sequence[Section]) -> Table | None:
+    """The measured maximum shear strain of each load and tissue, from the sections of the loads; None without any."""
+    tables = [(section.title, section.summary) for section in measured if section.summary is not None]
+    if not tables:
+        return None
+    rows = tuple((load, *row) for load, of in tables for row in of.rows)
+    note = _NOTE.format(_INTERVALS if any(of.note for _, of in tables) else "")
+    return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, note)

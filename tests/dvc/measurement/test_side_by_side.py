@@ -1,0 +1,84 @@
+"""The loads side by side: the unloaded image, then each load's own measured strain, in one slice with one scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import ImageFileError, InputError
+from dvc.images.image import Grid, Image, Mask
+from dvc.io.images.write import write_image
+from dvc.measurement.side_by_side import measured_by_load
+from dvc.measurement.subject import Subject
+
+GRID = Grid((10, 12, 14), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+STRAINS = {"Load1": 0.05, "Load2": 0.31}
+
+
+@pytest.fixture
+def subject() -> Subject:
+    body, bone = (np.zeros(GRID.shape, dtype=bool) for _ in range(2))
+    body[1:-1, 1:-1, 1:-1] = True
+    bone[3:6, 4:8, 6:10] = True  # its lowest voxels have z = 6 mm
+    return Subject(Image(GRID, body.astype(np.float32)), Mask(GRID, bone), Mask(GRID, body))
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> dict[str, Path]:
+    for load, strain in STRAINS.items():
+        (tmp_path / load).mkdir()
+        values = np.full(GRID.shape, strain, dtype=np.float32)
+        values[..., :3] = np.nan
+        write_image(tmp_path / load / "max_shear.nii.gz", Image(GRID, values))
+    return {load: tmp_path / load for load in STRAINS}
+
+
+def panels(subject: Subject, folders: dict[str, Path]) -> tuple[list[str], list[np.ma.MaskedArray], str]:
+    """Titles of the panels, the strain in those of the loads, and the caption."""
+    drawing = measured_by_load(subject, folders)
+    *slices, bar = drawing.figure.axes
+    strains = [axes.images[1].get_array() for axes in slices[1:]]
+    assert len(slices[0].images) == 1  # the image alone
+    assert {axes.images[1].norm.vmax for axes in slices[1:]} == {0.35} == {bar.get_xlim()[1]}
+    return [axes.get_title() for axes in slices], strains, drawing.caption
+
+
+def test_each_load_has_its_own_strain_in_soft_tissue_alone(subject: Subject, folders: dict[str, Path]) -> None:
+    titles, strains, caption = panels(subject, folders)
+    assert titles == ["Load0", "Load1", "Load2"]
+    # Sagittal at the first of the bone's lowest voxels, x = 3 mm: superior is up, anterior on the left.
+    assert "Sagittal, x = 3 mm, through the lowest point of the bone." in caption
+    body, bone, valid = np.zeros((14, 12), dtype=bool), np.zeros((14, 12), dtype=bool), np.ones((14, 12), dtype=bool)
+    body[1:-1, 1:-1] = bone[14 - 10 : 14 - 6, 4:8] = True
+    valid[-3:] = False
+    for page, strain in zip(strains, STRAINS.values(), strict=True):
+        np.testing.assert_array_equal(~np.ma.getmaskarray(page), body & ~bone & valid)
+        np.testing.assert_allclose(page.compressed(), strain, rtol=1e-6)
+
+
+def test_the_slice_has_the_plates_normal_and_its_shear_in_it(subject: Subject, folders: dict[str, Path]) -> None:
+    from_the_side = replace(subject, plate_normal=np.array([1.0, 0.0, 0.0]))
+    assert "Coronal" in panels(from_the_side, folders)[2]
+    shears_left = replace(subject, axes=np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
+    assert "Coronal" in panels(shears_left, folders)[2]
+
+
+def test_without_a_bone_it_goes_through_the_middle(subject: Subject, folders: dict[str, Path]) -> None:
+    titles, strains, caption = panels(replace(subject, bone=None), folders)
+    assert titles[1:] == list(folders)
+    assert caption.endswith("through the middle of the tissue.")
+    assert strains[0].count() == 12 * 10 - 2 * 10  # of the body, without what is not valid
+
+
+def test_a_map_that_is_lacking_or_lies_elsewhere_is_refused(subject: Subject, folders: dict[str, Path]) -> None:
+    write_image(
+        folders["Load2"] / "max_shear.nii.gz", Image(Grid((4, 4, 4), (1.0,) * 3, (0.0,) * 3), np.ones((4,) * 3))
+    )
+    with pytest.raises(ImageFileError):
+        measured_by_load(subject, folders)
+    (folders["Load2"] / "max_shear.nii.gz").unlink()
+    with pytest.raises((InputError, ImageFileError), match="Load2"):
+        measured_by_load(subject, folders)
