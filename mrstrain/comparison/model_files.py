@@ -96,7 +96,7 @@ def with_variants(
 
     def file(place: Path, model: str, load: str) -> ModelFile | None:
         chosen, reached = _chosen(place, [load])[1] if place.is_dir() else {}, _outcome(place, "reached")
-        if load not in chosen or reached.get(load, 1.0) < 1.0:
+        if load not in chosen or (reached is not None and reached.get(load, 0.0) < 1.0):
             return None
         return ModelFile(model, chosen[load], *_reading(place, usual, to_image))
 
