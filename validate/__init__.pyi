@@ -1,5 +1,6 @@
 from .agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from .comparison import Comparison, compare
+from .comparison_error import ComparisonError
 from .curves import RANGE, Area, Band, area_between, bands, check_range
 from .decomposition import (
     Decomposition,
@@ -21,17 +22,18 @@ from .mavm import ModelForm, model_form, safety_factor, signed_areas
 from .measured_boundary import boundary_displacement, simulate_driven, write_boundary_conditions
 from .misfit import check_in_tissue, check_models, displacement_slip, misfits
 from .ranking import ALL_LOADS, CohortRank, Ranking, rank_over_loads, rank_over_subjects
+from .sensitivity import SHARED, Variant
 from .tables import Curve
 
 __all__ = [
-    "ALL", "ALL_LOADS", "LEAST_ML", "LEVELLED", "NOTHING", "RANGE", "Agreement", "Area", "Band", "CellGraph",
-    "CohortRank", "Comparison", "Criteria", "Curve", "Decomposition", "FeResult", "Field", "GeometryError",
-    "InputError", "LoadCase", "LoadComparison", "MappedFields", "ModelForm", "OutputError", "Overlap", "Ranking",
-    "Reconstruction", "Representation", "SkinDisplacement", "StrainCluster", "Threshold", "TissueBasis",
-    "agreements", "area_between", "bands", "boundary_displacement", "check_bones", "check_in_tissue",
-    "check_models", "check_overlap", "check_range", "compare", "compare_load", "decompose", "displacement_slip",
-    "extrapolated", "filled_from_nearest", "map_fields", "misfits", "model_form", "over_subjects", "overlap",
-    "probability_of_representation", "rank_over_loads", "rank_over_subjects", "read_result", "read_thresholds",
-    "representation", "safety_factor", "signed_areas", "simulate_driven", "skin_displacement",
-    "write_boundary_conditions",
+    "ALL", "ALL_LOADS", "LEAST_ML", "LEVELLED", "NOTHING", "RANGE", "SHARED", "Agreement", "Area", "Band",
+    "CellGraph", "CohortRank", "Comparison", "ComparisonError", "Criteria", "Curve", "Decomposition", "FeResult",
+    "Field", "GeometryError", "InputError", "LoadCase", "LoadComparison", "MappedFields", "ModelForm",
+    "OutputError", "Overlap", "Ranking", "Reconstruction", "Representation", "SkinDisplacement", "StrainCluster",
+    "Threshold", "TissueBasis", "Variant", "agreements", "area_between", "bands", "boundary_displacement",
+    "check_bones", "check_in_tissue", "check_models", "check_overlap", "check_range", "compare", "compare_load",
+    "decompose", "displacement_slip", "extrapolated", "filled_from_nearest", "map_fields", "misfits", "model_form",
+    "over_subjects", "overlap", "probability_of_representation", "rank_over_loads", "rank_over_subjects",
+    "read_result", "read_thresholds", "representation", "safety_factor", "signed_areas", "simulate_driven",
+    "skin_displacement", "write_boundary_conditions",
 ]  # fmt: skip

@@ -22,6 +22,7 @@ from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
+from validate.comparison_error import ComparisonError
 from validate.curves import Area
 from validate.decomposition import Representation
 from validate.extrapolation import LEVELLED
@@ -43,9 +44,9 @@ class Comparison:
 
     Attributes
     ----------
-    areas, overlaps, agreements, skin : tuple of Area, Overlap, Agreement, SkinDisplacement
+    areas, overlaps, agreements, skin, errors : tuple of Area, Overlap, Agreement, SkinDisplacement, ComparisonError
         Rows by load and model: area between strain-volume curves by tissue, location of clusters above thresholds,
-        agreement cell by cell, displacement of the skin.
+        agreement cell by cell, displacement of the skin, and comparison error of each figure with its uncertainties.
     representations, model_forms : tuple of Representation, ModelForm
         Rows by load, model and tissue: image decomposition (CWA 16799), modified area validation metric.
     curves : tuple of Curve
@@ -80,6 +81,7 @@ class Comparison:
     notes: tuple[str, ...]
     warnings: tuple[str, ...] = ()
     loads: tuple[LoadComparison, ...] = ()
+    errors: tuple[ComparisonError, ...] = ()
 
     def summary(self) -> list[str]:
         """Verdict, areas, and significant differences, one line each."""
@@ -198,7 +200,7 @@ class Comparison:
         levels = {load: of.level for load, of in known.items()}
         levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
         areas, ranking = (*self.areas, *self.ranking.areas, self.ranking.nothing), self.ranking
-        rows = areas, self.overlaps, self.agreements, self.skin, self.representations, self.model_forms
+        rows = areas, self.overlaps, self.agreements, self.skin, self.representations, self.model_forms, self.errors
         tables.write_tables(target, rows, self.curves, levels)
         own: dict[str, object] = {
             "total_area_ml": {a.model: a.best_ml for a in ranking.areas}, "told_apart": list(ranking.statements),
@@ -221,7 +223,7 @@ class Comparison:
             If the folder does not contain a comparison.
         """
         place = Path(folder)
-        areas, overlaps, agreements, skin, represented, forms = tables.read_tables(place)
+        areas, overlaps, agreements, skin, represented, forms, errors = tables.read_tables(place)
         try:
             content = read_json(place / tables.RECORD)
             low, high = content["parameters"]["strains"]
@@ -235,7 +237,7 @@ class Comparison:
             raise InputError(f"{place / tables.RECORD} is not a valid record of a comparison ({error}).") from error
         by_load, curves = tuple(a for a in areas if a.load != ALL_LOADS), tables.read_curves(place)
         rows = by_load, overlaps, agreements, skin, represented, forms
-        return cls(*rows, curves, ranking, (low, high), coverage, verdict, verdicts, notes)
+        return cls(*rows, curves, ranking, (low, high), coverage, verdict, verdicts, notes, errors=errors)
 
 
 def _write_load(
@@ -313,6 +315,7 @@ def compare(
         curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
         ranking=rank_over_loads(loads), strains=by.strains, coverage_ml=coverage, verdict=verdict, verdicts=verdicts,
         notes=(*notes, *_doubts(verdict), *_limitations(loads)), warnings=tuple(odd), loads=tuple(loads),
+        errors=tuple(error for one in loads for error in one.errors),
     )  # fmt: skip
 
 

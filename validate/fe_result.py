@@ -4,6 +4,7 @@ A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, 
 .inp, ANSYS .cdb) and a table of nodal displacements (.csv: node number, and three components).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -20,6 +21,7 @@ from dvc.mesh import box_told
 from dvc.own_files import read_json
 from dvc.tables import read_table, refuse_half_a_line
 from validate.rigid_parts import without_rigid_parts
+from validate.sensitivity import Variant
 from validate.tetrahedra import linear_tetrahedra
 
 _NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")
@@ -48,21 +50,24 @@ class FeResult:
         Displacement (n, 3) of the mesh's nodes relative to the bone, LPS mm, in the frame of the unloaded image.
     rigid_parts : tuple of str
         Regions of the file that only moved and turned, such as a rigid plate. They are not part of the mesh.
+    variants : tuple of Variant
+        Solutions with one input changed, from which the input uncertainty of the model is computed.
     """
 
     name: str
     path: Path
     deformation: OnMesh
     rigid_parts: tuple[str, ...] = ()
+    variants: tuple[Variant, ...] = ()
 
     @classmethod
     @checked
-    def of(cls, name: str, deformation: OnMesh) -> "FeResult":
+    def of(cls, name: str, deformation: OnMesh, variants: Sequence[Variant] = ()) -> "FeResult":
         """The result of a model in memory, such as ``simulation.deformation("Load1")``, with its name in tables.
 
         InputError if ``deformation`` is not of the class that `fe.Simulation.deformation` returns.
         """
-        return cls(name, Path(name), deformation)
+        return cls(name, Path(name), deformation, variants=tuple(variants))
 
     @property
     def mesh(self) -> TetMesh:

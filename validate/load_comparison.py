@@ -17,6 +17,7 @@ from dvc.file_names import clash
 from dvc.trust.error_model import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
+from validate.comparison_error import ComparisonError, comparison_errors
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.decomposition import Decomposition, Representation, decompose, representation
 from validate.extrapolation import LEVELLED
@@ -24,6 +25,7 @@ from validate.fe_result import FeResult
 from validate.location import Overlap, Threshold
 from validate.mapping import ALL, MappedFields, map_fields
 from validate.mavm import ModelForm, model_form
+from validate.sensitivity import Sensitivity, changes_of
 
 _STRAINED = 0.01
 
@@ -151,6 +153,8 @@ class LoadComparison:
     bands, decompositions : mapping of tissue to Band, to Decomposition
         Empty where the measurement uncertainty is unknown. Each tissue is decomposed for itself, since strain is
         discontinuous at interfaces.
+    errors : tuple of ComparisonError
+        Comparison error of each figure, with its uncertainties; empty likewise.
     """
 
     case: LoadCase
@@ -165,6 +169,7 @@ class LoadComparison:
     model_forms: tuple[ModelForm, ...]
     bands: Mapping[str, Band]
     decompositions: Mapping[str, Decomposition]
+    errors: tuple[ComparisonError, ...] = ()
 
     @property
     def representations(self) -> tuple[Representation, ...]:
@@ -215,8 +220,10 @@ def compare_load(
     truths: list[FloatArray] = []
     if not bones:
         case = replace(case, error=None)  # it is known by distance to bone
-    known = {} if case.error is None else _bands(fields, case, case.error, by, truths)
+    uncertain = {} if case.error is None else _sensitivities(fields, results, by)
+    known = {} if case.error is None else _bands(fields, case, case.error, by, truths, uncertain)
     normal, cells = -case.axes[:, 0], location.CellGraph.of(fields.mesh)
+    levels = [threshold.max_shear for threshold in by.thresholds]
     return LoadComparison(
         case, labels, tuple(bones), by, fields,
         areas=tuple(_areas(fields, case.load, known, by)),
@@ -226,7 +233,22 @@ def compare_load(
         model_forms=tuple(_model_forms(fields, case.load)),
         bands=known,
         decompositions={} if case.error is None else _decompositions(fields, case.error, np.array(truths), cells),
+        errors=tuple(comparison_errors(case.load, fields, known, uncertain, levels, by.strains)),
     )  # fmt: skip
+
+
+def _sensitivities(fields: MappedFields, results: Sequence[FeResult], by: Criteria) -> dict[str, Sensitivity]:
+    """Sensitivity of each model that has variants, in the common cells."""
+    common = fields.common
+    points, volumes = fields.points_mm[common], fields.volumes_ml[common]
+    tissues = [cells[common] for name, cells in fields.parts.items() if name != ALL]
+    return {
+        one.name: Sensitivity.of(
+            one.name, changes_of(one.deformation, one.variants, points, volumes, tissues), DRAWS, by.seed
+        )
+        for one in results
+        if one.variants and not one.name.endswith(LEVELLED)
+    }
 
 
 def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Criteria) -> Iterator[Area]:
@@ -284,8 +306,9 @@ def _shears(fields: MappedFields) -> dict[str, FloatArray]:
 
 
 def _bands(
-    fields: MappedFields, case: LoadCase, error: ErrorTable, by: Criteria, first: list[FloatArray]
-) -> dict[str, Band]:
+    fields: MappedFields, case: LoadCase, error: ErrorTable, by: Criteria, first: list[FloatArray],
+    uncertain: Mapping[str, Sensitivity],
+) -> dict[str, Band]:  # fmt: skip
     """Bands by tissue; the ``first`` true fields drawn for them are kept for the intervals of location."""
     common, seed = fields.common, zlib.crc32(case.load.encode()) + by.seed
     shear, tissues = fields.measured.max_shear[common], [str(t).lower() for t in fields.tissue[common]]
@@ -300,4 +323,5 @@ def _bands(
 
     models = {name: shear[common] for name, shear in _shears(fields).items()}
     inside = {name: where[common] for name, where in fields.parts.items()}
-    return bands(truths(), models, fields.volumes_ml[common], inside, error.factor, draws.narrowed, by.strains)
+    volumes = fields.volumes_ml[common]
+    return bands(truths(), models, volumes, inside, error.factor, draws.narrowed, by.strains, uncertain)

@@ -55,8 +55,8 @@ class Ranking:
 def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     """Sum the areas over loads, and rank the models.
 
-    Errors of different loads are assumed to be independent. The normalised area is the mean over loads. Statements name
-    loads whose verdict is Do not trust.
+    Errors of the measurements of different loads are assumed to be independent; wrong inputs of a model are shared by
+    all loads. The normalised area is the mean over loads. Statements name loads whose verdict is Do not trust.
     """
     everywhere = [name for name in loads[0].fields.models if all(name in one.fields.models for one in loads)]
     band = _summed([one.bands.get(ALL) for one in loads], [*everywhere, NOTHING])
@@ -89,13 +89,22 @@ def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
 
 
 def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
-    """Areas to the drawn true fields, over all loads; None if the uncertainty of one is unknown."""
+    """Areas to the drawn true fields, over all loads; None if the uncertainty of one is unknown.
+
+    True fields are drawn for each load on its own; the inputs of models are the same under all loads in a draw.
+    """
     known = [band for band in bands if band is not None]
     if len(known) < len(bands):
         return None
     areas = {name: np.sum([band.areas_ml[name] for band in known], axis=0) for name in models}
-    floor, first = float(sum(band.floor_ml for band in known)), known[0]
-    return Band(first.strains, first.low_ml, first.high_ml, areas, floor, max(b.widening for b in known))
+    varied = {
+        name: np.sum([band.varied_ml.get(name, band.areas_ml[name]) for band in known], axis=0)
+        for name in models
+        if any(name in band.varied_ml for band in known)
+    }
+    floors, first = {name: sum(band.floors_ml[name] for band in known) for name in models}, known[0]
+    widest = max(band.widening for band in known)
+    return Band(first.strains, first.low_ml, first.high_ml, areas, floors, widest, varied)
 
 
 def _pairs(ranked: Sequence[Area], band: Band | None) -> Pairs:

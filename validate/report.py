@@ -14,6 +14,7 @@ from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volu
 from dvc.report.strips import MEASURED, Strip, strain_by_load
 from validate import figures, standards
 from validate.agreement import Agreement, SkinDisplacement
+from validate.comparison_error import validation_section
 from validate.curves import Area
 from validate.fe_result import FeResult
 from validate.load_comparison import NOTHING, LoadComparison
@@ -150,6 +151,7 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
         Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
+        *validation_section(one.load, one.errors, ALL),
         Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others), folded=True),
         standards.section(one, pictures.get(_COEFFICIENTS)),
     ]

@@ -18,6 +18,7 @@ from dvc.file_names import as_file_name
 from dvc.own_files import read_json, read_rows
 from dvc.report.drawing import figure_files
 from validate.agreement import Agreement, SkinDisplacement
+from validate.comparison_error import ComparisonError
 from validate.curves import Area
 from validate.decomposition import Representation
 from validate.load_comparison import LoadComparison
@@ -29,8 +30,9 @@ RECORD = "comparison.json"
 TABLES = {
     "areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement,
     "decomposition.csv": Representation, "mavm.csv": ModelForm,
+    "comparison_error.csv": ComparisonError,
 }  # fmt: skip
-_LATER = (Representation, ModelForm)  # older comparisons have no such table
+_LATER = (Representation, ModelForm, ComparisonError)  # older comparisons have no such table
 CURVES = "curves.csv"
 OF_ALL_LOADS = ("slices_by_load", "curves_by_load")
 """Stems of the figures under all loads."""

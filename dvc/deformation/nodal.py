@@ -75,6 +75,10 @@ class OnMesh:
         steps = np.stack([u[:, i] - u[:, 0] for i in (1, 2, 3)], axis=2)
         return np.asarray(steps @ self._locator.inverse)
 
+    def cells_at(self, points_mm: FloatArray) -> IntArray:
+        """Cell of the mesh in which each point (n, 3) LPS mm lies, (n,); -1 outside."""
+        return self._locator.find(points_mm)[0]
+
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X) (n, 3) mm at points X (n, 3) LPS mm; NaN outside the mesh."""
         return self.evaluate(points_mm)[0]

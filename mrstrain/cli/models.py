@@ -79,6 +79,14 @@ def compare(
             rich_help_panel="Model",
         ),
     ] = None,
+    variants: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder with results of a model with one input changed, and a variant.toml; or a folder of such "
+            "folders. They give the input uncertainty. Repeat for several.",
+            rich_help_panel="Model",
+        ),
+    ] = None,
 ) -> None:  # fmt: skip
     """Compare FE models of any code with a measurement: strain-volume curves, area metric, location, agreement."""
     from mrstrain.records.inputs import read_matrix
@@ -86,7 +94,7 @@ def compare(
     matrix = None if to_image is None else read_matrix(to_image)
     carry_out(
         mrstrain.compare.with_options, dvc, models, out=out, labelling=labelling, reading=reading, to_image=matrix,
-        directions=directions, comparison=comparison,
+        directions=directions, comparison=comparison, variants=variants or (),
     )  # fmt: skip
 
 

@@ -76,6 +76,9 @@ def run(
     force: Annotated[
         list[str] | None, typer.Option(help="Stages to run again, by kind or name. Repeat for several.")
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Leave out the further solutions for the input uncertainty of the models.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be done.")] = False,
     report_only: Annotated[bool, typer.Option("--report-only", help="Only write the report again.")] = False,
     scheduler: Scheduler = None,
@@ -87,16 +90,16 @@ def run(
 
     given = {"--only": only, "--force": force, "--scheduler": scheduler, "--workers": workers}
     if report_only:
-        _refuse_idle("--report-only runs nothing", given | {"--dry-run": dry_run})
+        _refuse_idle("--report-only runs nothing", given | {"--dry-run": dry_run, "--quick": quick})
         tell(report(study))
     elif dry_run:
         _refuse_idle("--dry-run runs nothing", {name: given[name] for name in ("--scheduler", "--workers")})
-        for name, told in forecast(study, only=only or (), force=force or ()).items():
+        for name, told in forecast(study, only=only or (), force=force or (), quick=quick).items():
             say(f"{name}: {told}")
     else:
         _carry_out(
             mrstrain.run, study, only=only or (), force=force or (), scheduler=scheduler, workers=workers,
-            on_report=None if no_open or not can_open() else show,
+            quick=quick, on_report=None if no_open or not can_open() else show,
         )  # fmt: skip
 
 

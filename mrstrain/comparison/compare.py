@@ -20,7 +20,8 @@ from fe import read_tet_mesh
 from mrstrain.comparison.credibility import Holdings, credibility_section
 from mrstrain.comparison.from_record import fill_directions, fill_labels, taken_from_record
 from mrstrain.comparison.methods import methods
-from mrstrain.comparison.model_files import ModelFile, model_files
+from mrstrain.comparison.model_files import ModelFile, model_files, with_variants
+from mrstrain.models.variant_files import variant_folders
 from mrstrain.options.door import door
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
@@ -52,7 +53,8 @@ def compare(
     dvc: Path | str, models: Sequence[Path | str], *, out: Path | str, labelling: ComparisonLabels,
     loads: Sequence[str] = (), reading: ModelReading, to_image: FloatArray | None = None,
     directions: ComparisonDirections, towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    comparison: ComparisonOn, progress: OnProgress | None = None,
+    comparison: ComparisonOn, variants: Sequence[Path | str] = (), remarks: Sequence[str] = (),
+    progress: OnProgress | None = None,
 ) -> Compared:  # fmt: skip
     """Compare finite-element models of any code with a measurement; see `validate.compare`.
 
@@ -75,6 +77,11 @@ def compare(
         Outward normal of the plate and direction of shear, LPS (3,), of loads with their own directions, by name.
     labelling, reading, directions, comparison
         Their fields are given as keywords, such as ``strains=...``.
+    variants : sequence of path
+        Folders with results of the models with one input changed, each with a ``variant.toml``, or folders of such
+        folders. They give the input uncertainty of the models.
+    remarks : sequence of str
+        Sentences for the notes of the report.
     progress : callable, optional
         ``progress(case, stage, fraction)``; the case "note" first tells what was taken from the record.
 
@@ -102,10 +109,14 @@ def compare(
     pairs = {load: (of.plate_normal, of.shear_direction) for load, of in of_load.items()} | dict(towards or {})
     axes, own = _axes(usual.plate_normal, usual.shear_direction), {load: _axes(*of) for load, of in pairs.items()}
     files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], reading, to_image)
+    varied = variant_folders(Path(place) for place in variants)
+    files, of_variants = with_variants(files, varied, reading, to_image)
+    notes = [*remarks, *notes, *of_variants]
     results = [file for of in files.values() for file in of]
     inputs = {
         "measured": [f for m in measurements for f in m.files],
         "models": [*(file.path for file in results), *dict.fromkeys(p for file in results for p in file.reading.paths)],
+        **({"variants": list(dict.fromkeys(p for file in results for p in file.variant_paths))} if varied else {}),
         **labelling.files,
         "mesh": [] if comparison.mesh is None else [comparison.mesh],
         "error_models": [f for m in measurements if (f := m.folder / ERROR_MODEL).is_file()],

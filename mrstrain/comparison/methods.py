@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dvc.io.images.read import format_of
 from dvc.io.result_folder import PROVENANCE, QUALITY
 from dvc.registration.engines import methods_of
@@ -34,6 +36,8 @@ _PAPERS = {
     "39(4):117, 2020. doi:10.1145/3386569.3392385",
     "Trebbi 2023": "Trebbi A, Fougeron N, Payan Y. Definition and evaluation of a finite element model of the human "
     "heel for diabetic foot ulcer prevention under shearing loads. Med Eng Phys, 2023.",
+    "Roache 1994": "Roache PJ. Perspective: a method for uniform reporting of grid refinement studies. J Fluids Eng "
+    "116(3):405-413, 1994. doi:10.1115/1.2910291",
     "Dice 1945": "Dice LR. Measures of the amount of ecologic association between species. Ecology 26(3):297-302, "
     "1945. doi:10.2307/1932409",
     "Lin 1989": "Lin LI-K. A concordance correlation coefficient to evaluate reproducibility. Biometrics "
@@ -62,6 +66,7 @@ def methods(
     """
     compared = _compared(len(comparison.loads[0].fields.points_mm), criteria)
     uncertainty = [_uncertainty(measured)] if any(one.bands for one in comparison.loads) else []
+    uncertainty += [of] if (of := _of_inputs(comparison)) else []
     viewer = f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue)."
     acquired = _acquired(measured)
     return _with_references(
@@ -248,6 +253,21 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
         f"The intervals (95 % coverage) of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed "
         "from true fields drawn with the error model of the registration (bias and spatially correlated noise). "
         f"{_sources(errors)} {twin or ''}{decomposed}There is no error model of displacement."
+    )
+
+
+def _of_inputs(comparison: Comparison) -> str:
+    """How the uncertainty of the models' inputs was carried through; empty where none was given."""
+    by_mesh = dict.fromkeys(e.model for e in comparison.errors if not np.isnan(e.u_num))
+    by_input = dict.fromkeys(e.model for e in comparison.errors if not np.isnan(e.u_input))
+    if not by_mesh and not by_input:
+        return ""
+    parts = [f"inputs of {_listed(list(by_input))}"] * bool(by_input)
+    parts += [f"the mesh of {_listed(list(by_mesh))} (grid convergence index, Roache 1994)"] * bool(by_mesh)
+    return (
+        f"The uncertainty of {' and of '.join(parts)} was propagated linearly, from a further solution with each input "
+        "changed, and is part of these intervals. The comparison error E = S - D and its standard uncertainties u_num, "
+        "u_input and u_D follow ASME V&V 20-2009."
     )
 
 

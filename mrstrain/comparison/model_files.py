@@ -1,21 +1,23 @@
 """Files of the models by load, and the settings with which they are read: mesh, unit, frame."""
 
 import tomllib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from dvc import Grid
 from dvc.arrays import FloatArray
+from dvc.deformation.nodal import OnMesh
 from dvc.errors import ExtentError, InputError
 from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import read_json
+from mrstrain.models.variant_files import VariantFolder
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import matrix_of, read_matrix
 from mrstrain.records.outcome import with_reasons
-from validate import FeResult, check_overlap, read_result
+from validate import FeResult, Variant, check_overlap, read_result
 from validate.run_end import early_end
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
@@ -34,9 +36,34 @@ class ModelFile:
     path: Path
     reading: ModelReading
     to_image: FloatArray | None = None  # as in `validate.read_result`
+    variants: tuple["VariantFile", ...] = ()
+
+    @property
+    def variant_paths(self) -> tuple[Path, ...]:
+        """Files of its variants, and of the solutions with which these are compared."""
+        pairs = ((one.varied.path, *(() if one.base is None else (one.base.path,))) for one in self.variants)
+        return tuple(dict.fromkeys(path for pair in pairs for path in pair))
 
     def read(self, grid: Grid) -> FeResult:
-        """Read the result, which must lie in the image on this grid; errors as `read_result` and `check_overlap`."""
+        """Read the result, which must lie in the image on this grid; errors as `read_result` and `check_overlap`.
+
+        Its variants are read when they are needed.
+        """
+        result = self._read(grid)
+        reads = {of: of.deformation for one in self.variants if (of := one.base) is not None}  # each base once
+        variants = tuple(
+            Variant(one.input, one.steps, one.varied.deformation, None if one.base is None else reads[one.base])
+            for one in self.variants
+        )
+        return replace(result, variants=variants) if variants else result
+
+    def deformation(self) -> OnMesh:
+        """The deformation alone; errors as `read_result`."""
+        mesh, unit, frame = self.reading.model_mesh, self.reading.model_unit, self.reading.model_frame
+        how = {"mesh": mesh, "unit": unit, "frame": frame, "to_image": self.to_image}
+        return read_result(self.name, self.path, **how).deformation  # type: ignore[arg-type]
+
+    def _read(self, grid: Grid) -> FeResult:
         mesh, unit, frame = self.reading.model_mesh, self.reading.model_unit, self.reading.model_frame
         try:
             result = read_result(self.name, self.path, mesh=mesh, unit=unit, frame=frame, to_image=self.to_image)
@@ -44,6 +71,49 @@ class ModelFile:
             raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
         check_overlap(self.path, result.mesh, grid)
         return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VariantFile:
+    """A result with one input changed for one load, and the result with which it is compared; None: the model."""
+
+    input: str
+    steps: float
+    varied: ModelFile
+    base: ModelFile | None
+
+
+def with_variants(
+    files: Mapping[str, Sequence[ModelFile]], folders: Sequence[VariantFolder], usual: ModelReading,
+    to_image: FloatArray | None = None,
+) -> tuple[dict[str, list[ModelFile]], list[str]]:  # fmt: skip
+    """The files of the models by load with those of their variants; and a sentence for each variant that has none.
+
+    Variants of models that are not compared are left out.
+    """
+    bases: dict[tuple[Path, str], ModelFile] = {}
+    notes = list[str]()
+
+    def file(place: Path, model: str, load: str) -> ModelFile | None:
+        chosen, reached = _chosen(place, [load])[1] if place.is_dir() else {}, _outcome(place, "reached")
+        if load not in chosen or (reached is not None and reached.get(load, 0.0) < 1.0):
+            return None
+        return ModelFile(model, chosen[load], *_reading(place, usual, to_image))
+
+    def with_own(model: ModelFile, load: str) -> ModelFile:
+        found = []
+        for one in (folder for folder in folders if folder.record.model == model.name):
+            base, varied = None, file(one.place, model.name, load)
+            if one.base is not None:
+                made = file(one.base, model.name, load)
+                base = None if made is None else bases.setdefault((one.base.resolve(), load), made)
+            if varied is None or (one.base is not None and base is None):
+                notes.append(f"{model.name}: the variant of '{one.record.input}' has no result for {load}.")
+            else:
+                found.append(VariantFile(one.record.input, one.record.steps, varied, base))
+        return replace(model, variants=tuple(found))
+
+    return {load: [with_own(model, load) for model in of] for load, of in files.items()}, notes
 
 
 def model_files(

@@ -7,7 +7,7 @@ from dvc import Subject
 from dvc.report.page import Section, Table
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
-_INTERVALS = ", with the 95 % confidence interval in brackets"
+_INTERVALS = ", with the interval of 95 % coverage in brackets"
 
 
 def measured_strain(

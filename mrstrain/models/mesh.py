@@ -4,8 +4,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from dvc import TetMesh, read_labels
-from dvc.errors import InputError, OutputError
+import numpy as np
+
+from dvc import Grid, LabelMap, TetMesh, read_labels, write_labels
+from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.report.drawing import ENDINGS, save_figure
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
@@ -99,3 +101,35 @@ def mesh(
         write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     save_figure(target.with_suffix(""), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
     return Meshed(target, made, quality)
+
+
+def mesh_coarser(
+    labels: Path, *, out: Path, ratio: float, labelling: Labelling, meshing: Meshing,
+    watch: Callable[[float], None] | None = None,
+) -> Meshed:  # fmt: skip
+    """Mesh a label map with edges that are longer by a ratio, and with voxels as much larger, if no tissue is lost.
+
+    In thin tissues the voxels and not the edge length limit the size of the cells. The label map with these voxels is
+    written next to the mesh. Other parameters and errors as in `mesh`.
+    """
+    longer = meshing.model_copy(update={"edge_mm": ratio * meshing.edge_mm})
+    if longer.finer is not None:
+        longer = longer.model_copy(update={"finer": longer.finer._replace(edge_mm=ratio * longer.finer.edge_mm)})
+    out.parent.mkdir(parents=True, exist_ok=True)
+    place = out.with_name("labels.nii.gz")
+    write_labels(place, _coarser(read_labels(labels, labelling.names), ratio))
+    beside = labelling.model_copy(update={"names": place.with_name("labels.csv")})
+    try:
+        return mesh.with_options(place, out=out, labelling=beside, meshing=longer, watch=watch)
+    except MrstrainError:  # a tissue is too thin for these voxels
+        return mesh.with_options(labels, out=out, labelling=labelling, meshing=longer, watch=watch)
+
+
+def _coarser(labels: LabelMap, ratio: float) -> LabelMap:
+    """A label map with voxels that are larger by a ratio, each with the label at its centre."""
+    grid = labels.grid
+    i, j, k = (max(int(n / ratio), 1) for n in grid.shape)
+    wide = Grid((i, j, k), ratio * grid.spacing_mm, grid.points_at(np.full(3, 0.5 * (ratio - 1.0))), grid.direction)
+    at = np.rint(grid.indices_of(wide.points().reshape(-1, 3))).astype(np.int64)
+    at = np.clip(at, 0, np.array(grid.shape) - 1)
+    return LabelMap(wide, labels.labels[tuple(at.T)].reshape(i, j, k), labels.names)

@@ -309,6 +309,10 @@ class _Look:
         soft = [name for name in NAMES.values() if not is_bones_name(name)] if labels is None else self.soft(labels)
         for one in sets:
             self.tried(one.for_regions, soft)
+        for region in self.study.uncertainty.stiffness:
+            if region not in soft:
+                at = self.study.at("uncertainty", "stiffness")
+                self.wrong.append(f"{at}: there is no soft tissue '{region}'; there are {', '.join(soft)}.")
         if "cut" in fixed and "skin" not in {name.casefold() for name in soft}:
             self.wrong.append(
                 "[models] fixed: 'cut' (the truncation surface) can only be detected if a tissue of the label map is "

@@ -15,7 +15,7 @@ from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.records.progress import duration
 from mrstrain.studies.file import Study
-from mrstrain.studies.plan import Stage, drawn_to_mesh, mesh_place
+from mrstrain.studies.plan import COARSE, Stage, drawn_to_mesh, mesh_place
 from mrstrain.studies.time_left import Expected, TimeLeft
 
 CARE = "WARNING"
@@ -32,6 +32,7 @@ _SOFT_MPA, _SOFTER = 0.01, 0.4
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
 _MESH_S, _LABEL_S_PER_MVOXEL = 25.0, 5.0
+_COARSER, _SHORT = 0.35, 0.2  # of the time of a solution: on the coarser mesh, and from the state of another solution
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
 # with strain discontinuities 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells
@@ -86,7 +87,10 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
         models = len(set(stage.some.get("models", {}).values()))
         return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
     seconds = float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
-    if stage.kind != "simulate":
+    if stage.kind == "vary":
+        whole, short = study.uncertainty.solutions
+        seconds *= (whole + _SHORT * short) * (_COARSER if stage.arguments["coarse"] else 1.0)
+    elif stage.kind != "simulate":
         return seconds
     (one,) = stage.arguments["sets"]
     softest_mpa = min(material.shear_modulus_mpa for material in material_set(one).materials.values())
@@ -101,8 +105,8 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
     if stage.kind in ("register", "level"):
         cost = _cost(study)
         return _REGISTER_GIB + cost.gib + cost.gib_per_mvoxel * voxels / 1e6
-    if stage.kind in ("simulate", "drive"):
-        times = _ELEMENT_GIB[study.models.element if stage.kind == "simulate" else "P1"]
+    if stage.kind in ("simulate", "vary", "drive"):
+        times = _ELEMENT_GIB["P1" if stage.kind == "drive" else study.models.element]
         return _SIMULATE_GIB + times * _SIMULATE_GIB_PER_CELL * cells
     if stage.kind == "compare":
         return _COMPARE_GIB * (1 + min(len(study.loads), usable_cores()))
@@ -150,6 +154,12 @@ def costs(
         f"To do: {len(left)} of {len(stages)} stages, about {time} on {workers} cores, "
         f"{needed:.1f} GiB of memory, {disk:.1f} GB of disk space ({free:.0f} GB free)."
     ]
+    if further := [stage for stage in left if stage.kind == "vary" or stage.name == COARSE]:
+        added = duration(sum(seconds_of(stage, study, voxels, cells) for stage in further) / workers)
+        lines.append(
+            f"Of these, {len(further)} stages are further solutions for the input uncertainty of the models, about "
+            f"{added}; `mrstrain run --quick` leaves them out."
+        )
     if disk > free:
         lines.append(f"{CARE}: there is too little free disk space.")
     there = usable_memory_bytes()

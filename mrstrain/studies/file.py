@@ -18,6 +18,7 @@ from mrstrain.options.acquisition import AcquisitionOptions
 from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.options.measurement import AUTO, Frame, RegistrationOptions, SubjectFiles, Unit, command_parts
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
+from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.inputs import made_labels
 
 FILE = "study.toml"
@@ -174,11 +175,16 @@ class Study(_Part):
     compare: modelling.ComparisonOptions = modelling.ComparisonOptions()
     acquisition: AcquisitionOptions = AcquisitionOptions()
     credibility: CredibilityOptions = CredibilityOptions()
+    uncertainty: Uncertainty = Uncertainty()
     _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
 
     def at(self, table: str, key: str) -> str:
         """A key of a table with its line in the file, for messages."""
         return _named(self._lines, table, key)[1]
+
+    def quickly(self) -> Self:
+        """The same without the further solutions for the input uncertainty of the models."""
+        return self.model_copy(update={"uncertainty": self.uncertainty.model_copy(update={"quick": True})})
 
     @property
     def out(self) -> Path:

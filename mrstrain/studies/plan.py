@@ -17,10 +17,11 @@ from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, Pla
 from mrstrain.studies.file import Study
 from validate import LEVELLED
 
-KINDS = ("label", "register", "mesh", "simulate", "drive", "level", "compare")
+KINDS = ("label", "register", "mesh", "simulate", "vary", "drive", "level", "compare")
 """Kinds of stages, in their order."""
 
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
+VARIANTS, COARSE_MESH, COARSE = "variants", "mesh-coarse/mesh.vtu", "mesh coarse"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class Stage:
     @property
     def goes_on(self) -> bool:
         """Whether it resumes after an interruption by itself, using only results that are still valid."""
-        return self.kind == "simulate"
+        return self.kind in ("simulate", "vary")
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -69,24 +70,30 @@ def plan(study: Study) -> tuple[Stage, ...]:
     stages = [*_labelling(study), *_registrations(study)]
     measured = {f"register {load}": load for load in study.loads}
     models: dict[str, Path] = {}
+    variants: dict[str, Path] = {}
     if study.models.sets and study.mesh.file is None:
         stages.append(_mesh(study))
+        if coarser(study):
+            stages.append(_mesh(study, study.uncertainty.mesh))
     for one in study.models.sets:
         own = [_simulation(study, one)]
         folder = own[0].gives[0]
+        if study.uncertainty.solves:
+            own.append(_variation(study, own[0]))
+            variants[own[-1].name] = own[-1].gives[0]
         if study.models.drive:
             driven, dvc = study.out / MODELS / (folder.name + ENDING), {"dvc": study.out / REGISTRATION}
             own.append(_on_mesh(study, f"drive {folder.name}", one, driven, dvc, {"loads": measured}))
         earlier = dict.fromkeys(place.name for place in models.values())
-        if twice := clash([*earlier, *(stage.gives[0].name for stage in own)]):
+        if twice := clash([*earlier, *(stage.gives[0].name for stage in own if stage.kind != "vary")]):
             raise InputError(f"[models] sets: two material sets are named {twice}; rename one.")
-        models |= {stage.name: stage.gives[0] for stage in own}
+        models |= {stage.name: stage.gives[0] for stage in own if stage.kind != "vary"}
         if study.models.level:
             own += [_levelled(study, folder, load) for load in load_steps(study)]
             models |= {stage.name: stage.gives[0].parent for stage in own if stage.kind == "level"}
         stages += own
     if models or study.models.results:
-        stages.append(_comparison(study, measured, models))
+        stages.append(_comparison(study, measured, models, variants))
     _refuse_mixing(study, stages)
     return tuple(stages)
 
@@ -187,14 +194,37 @@ def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
     return study.path(study.mesh.labels), study.optional_path(study.mesh.names)
 
 
-def _mesh(study: Study) -> Stage:
+def coarser(study: Study) -> bool:
+    """Whether a coarser mesh is made for the further solutions; a mesh that is given has none."""
+    return study.uncertainty.solves and bool(study.uncertainty.mesh) and study.mesh.file is None
+
+
+def _mesh(study: Study, ratio: float | None = None) -> Stage:
+    """The stage that makes the mesh, or one with edges that are longer by a ratio."""
     labels, names = labels_to_mesh(study)
+    out = study.out / (MESH if ratio is None else COARSE_MESH)
     arguments = {
-        "out": study.out / MESH, "labels": labels, "names": names, "bones": study.mesh.bones,
+        "out": out, "labels": labels, "names": names, "bones": study.mesh.bones,
         **study.mesh.narrowed(Meshing).model_dump(),
-    }  # fmt: skip
+    } | ({} if ratio is None else {"ratio": ratio})  # fmt: skip
     after = _labelled(study) if study.mesh.labels is None else ()
-    return Stage("mesh", arguments, study.given([labels, names]), ((study.out / MESH).parent,), after)
+    return Stage("mesh" if ratio is None else COARSE, arguments, study.given([labels, names]), (out.parent,), after)
+
+
+def _variation(study: Study, simulation: Stage) -> Stage:
+    """The stage that solves a material set with one input changed, by the stage that simulates it."""
+    (folder,) = simulation.gives
+    coarse = study.out / COARSE_MESH if coarser(study) else None
+    spread = study.uncertainty.model_dump(exclude={"variants", "quick"})
+    labels, names = labels_to_mesh(study)
+    out = study.out / VARIANTS / folder.name
+    own = {
+        "out": out, "base": folder, "coarse": coarse, "labels": labels, "names": names,
+        "uncertainty": spread,
+    }  # fmt: skip
+    after = dict.fromkeys((*simulation.after, *((COARSE,) if coarse else (simulation.name,)), *_labelled(study)))
+    files = (*simulation.files, *study.given([labels, names]))
+    return Stage(f"vary {folder.name}", {**simulation.arguments, **own}, files, (out,), tuple(after))
 
 
 def _on_mesh(
@@ -257,7 +287,9 @@ def _levelled(study: Study, folder: Path, load: str) -> Stage:
     return Stage(f"level {folder.name} {load}", arguments, own, gives, after)
 
 
-def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, Path]) -> Stage:
+def _comparison(
+    study: Study, measured: Mapping[str, str], models: Mapping[str, Path], variants: Mapping[str, Path]
+) -> Stage:  # fmt: skip
     how = study.compare.located(study.place)
     labels, names = study.labels
     elsewhere = [study.path(place) for place in study.models.results]
@@ -269,7 +301,11 @@ def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, 
         "bones": study.mesh.bones, **study.plate.narrowed(Directions).model_dump(), "towards": study.directions,
         **how.model_dump(), "elsewhere": elsewhere,
     }  # fmt: skip
+    given = [study.path(place) for place in study.uncertainty.variants]
+    arguments |= {"variants_elsewhere": given} if given else {}
+    arguments |= {"quick": True} if study.uncertainty.quick else {}
     named = [file for place in elsewhere if place.exists() for file in files_named(place)]
-    files = study.given([labels, names, *how.paths, *elsewhere, *named])
+    files = study.given([labels, names, *how.paths, *elsewhere, *named, *given])
     some = {"loads": measured} | ({"models": models} if models else {})
-    return Stage("compare", arguments, files, (study.out / COMPARISON,), _labelled(study), some)
+    perhaps = {"variants": variants} if variants else {}
+    return Stage("compare", arguments, files, (study.out / COMPARISON,), _labelled(study), some, perhaps)

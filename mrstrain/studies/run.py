@@ -72,7 +72,8 @@ class StudyRun:
 
 def run(
     study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = (), scheduler: str | None = None,
-    workers: int | None = None, progress: OnProgress | None = None, on_report: OnReport | None = None,
+    workers: int | None = None, quick: bool = False, progress: OnProgress | None = None,
+    on_report: OnReport | None = None,
 ) -> StudyRun:  # fmt: skip
     """Run a study: register, mesh, simulate, compare and report.
 
@@ -89,6 +90,8 @@ def run(
         machine are used.
     workers : int, optional
         Number of stages at the same time on this machine; by default one for each core.
+    quick : bool
+        Leave out the further solutions for the input uncertainty of the models ([uncertainty]); the report says so.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
     on_report : callable, optional
@@ -111,9 +114,14 @@ def run(
         If another run uses the same folder, or it cannot be written to.
     """
     return run_studies(
-        [read_study(study)], only=only, force=force, scheduler=scheduler, workers=workers,
+        [_chosen(study, quick)], only=only, force=force, scheduler=scheduler, workers=workers,
         follower=Follower(progress, on_report),
     )[0]  # fmt: skip
+
+
+def _chosen(study: Path | str | Study, quick: bool) -> Study:
+    told = read_study(study)
+    return told.quickly() if quick and told.uncertainty.solves else told
 
 
 def run_studies(
@@ -212,9 +220,11 @@ def report(study: Path | str | Study) -> StudyRun:
     return StudyRun(study, outcomes)
 
 
-def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
+def forecast(
+    study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = (), quick: bool = False
+) -> dict[str, str]:
     """What `run` would do with each stage (`Pipeline.forecast`); parameters and errors as in `run`."""
-    return _planned({"": read_study(study)}, only, force)[0][""].forecast()
+    return _planned({"": _chosen(study, quick)}, only, force)[0][""].forecast()
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:

@@ -7,16 +7,22 @@ returns its contribution to the report and the log.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dvc import Verdict
 from dvc.report.page import Section
 from dvc.worker import Worker
+from mrstrain.options.model import Options
 from mrstrain.records.progress import NOTE
 
+_M = TypeVar("_M", bound=Options)
 Tell = Callable[[str, float], None]
 _REGISTERING = {"aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2)}
 # of a registration's time: when each of its parts begins, and how much of it the part takes
+_LEFT_OUT = (
+    "The further solutions for the input uncertainty of the models were left out (quick): intervals and significant "
+    "differences take mesh, forces, directions and parameters of simulated models as exact."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +73,25 @@ def _whole(tell: Tell) -> Tell:
     return told
 
 
-def mesh(tell: Tell, *, labels: Path, **options: Any) -> StageResult:
-    """Mesh the soft tissue of a label map; as `mrstrain.mesh`."""
-    from mrstrain.models.mesh import mesh as run
+def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any) -> StageResult:
+    """Mesh the soft tissue of a label map; as `mrstrain.mesh`, or with edges that are longer by a ratio."""
+    from mrstrain.models.mesh import mesh as run, mesh_coarser
+    from mrstrain.options.modelling import Labelling, Meshing
 
-    lines = run(labels, watch=lambda share: tell("meshing", share), **options).summary()
+    def watch(share: float) -> None:
+        tell("meshing", share)
+
+    if ratio is None:
+        lines = run(labels, watch=watch, **options).summary()
+    else:
+        how, which = _chosen(Meshing, options), _chosen(Labelling, options)
+        lines = mesh_coarser(labels, ratio=ratio, labelling=which, meshing=how, watch=watch, **options).summary()
     return StageResult(tuple(lines), headline=lines[0])
+
+
+def _chosen(model: type[_M], options: dict[str, Any]) -> _M:
+    """A model of options, whose fields are taken out of the others."""
+    return model.of({name: options.pop(name) for name in model.model_fields if name in options})
 
 
 def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **options: Any) -> StageResult:
@@ -92,6 +111,27 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
     done = run(mesh, loads=steps, workers=1, threads=1, progress=told, **options)
     headline = "; ".join(one.headline for one in done.sets)
     return StageResult(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), headline=headline)
+
+
+def vary(
+    tell: Tell, *, mesh: Path, labels: Path, names: Path | None, loads: Sequence[Mapping[str, Any]],
+    uncertainty: Mapping[str, Any], **options: Any,
+) -> StageResult:  # fmt: skip
+    """Solve a material set with one input changed at a time; as `mrstrain.models.vary.vary`."""
+    from dvc import read_labels
+    from fe import LoadStep
+    from mrstrain.models.vary import vary as run
+    from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
+    from mrstrain.options.uncertainty import Uncertainty
+
+    voxel_mm = float(read_labels(labels, names).grid.spacing_mm.min())
+    simulation, plate = _chosen(SimulationOptions, options), _chosen(PlateOptions, options)
+    done = run(
+        mesh, simulation=simulation, plate_options=plate, coordinates=_chosen(MeshCoordinates, options),
+        loads=[LoadStep(**load) for load in loads], uncertainty=Uncertainty.of(uncertainty), voxel_mm=voxel_mm,
+        tell=tell, **options,
+    )  # fmt: skip
+    return StageResult(tuple(done.summary()), complete=done.complete, headline=done.lines[0])
 
 
 def drive(tell: Tell, *, sets: Sequence[str], **options: Any) -> StageResult:
@@ -121,5 +161,10 @@ def compare(tell: Tell, **options: Any) -> StageResult:
     from mrstrain.comparison.compare import compare as run
 
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
-    done = run(options.pop("dvc"), models, progress=lambda _, *stage: tell(*stage), **options)
+    variants = [*options.pop("variants", []), *options.pop("variants_elsewhere", [])]
+    remarks = [_LEFT_OUT] if options.pop("quick", False) else []
+    done = run(
+        options.pop("dvc"), models, variants=variants, remarks=remarks, progress=lambda _, *stage: tell(*stage),
+        **options,
+    )  # fmt: skip
     return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing, headline=done.comparison.headline)

@@ -1,0 +1,63 @@
+"""How uncertain the inputs of the models of a study are: its table [uncertainty]."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, Field, field_validator
+
+from mrstrain.options.model import Flag, NotNegative, Options
+
+LEAST_RATIO, MOST_RATIO = 1.2, 2.5
+
+
+def _different(paths: tuple[Path, ...]) -> tuple[Path, ...]:
+    if len(set(paths)) < len(paths):
+        raise ValueError("each folder may occur only once")
+    return paths
+
+
+class Uncertainty(Options):
+    """Standard uncertainty of each input of the models; 0, the default, takes the input as exact."""
+
+    mesh: NotNegative = 0.0
+    """Ratio of the edge lengths of a coarser mesh to those of the mesh, such as 1.4, to estimate the error of the
+    mesh; all solutions with a changed input are computed on it, too."""
+    force: NotNegative = 0.0
+    """Of the plate's forces, relative."""
+    force_n: NotNegative = 0.0
+    """Of the plate's forces, N, in addition."""
+    direction_deg: NotNegative = 0.0
+    """Of the plate's normal, in each of the two directions of tilt, degrees."""
+    poisson: NotNegative = 0.0
+    """Of 0.5 - nu of every material, relative."""
+    stiffness: dict[str, NotNegative] = Field(default_factory=dict)
+    """Of the stiffness of a tissue, relative, by the name of the tissue."""
+    labels_voxels: NotNegative = 0.0
+    """Of the boundary of the bone, and of the inside of the skin, in voxels of the label map that is meshed."""
+    variants: Annotated[tuple[Path, ...], AfterValidator(_different)] = ()
+    """Folders with variants of the models of other codes, each with a ``variant.toml``."""
+    quick: Flag = False
+    """Leave the further solutions out."""
+
+    @field_validator("mesh")
+    @classmethod
+    def _coarser(cls, ratio: float) -> float:
+        if ratio and not LEAST_RATIO <= ratio <= MOST_RATIO:
+            raise ValueError(
+                f"the edges of the coarser mesh must be {LEAST_RATIO:g} to {MOST_RATIO:g} times as long, or 0 for none"
+            )
+        return ratio
+
+    @property
+    def solves(self) -> bool:
+        """Whether there are further solutions to compute."""
+        given = (self.mesh, self.force, self.force_n, self.direction_deg, self.poisson, self.labels_voxels)
+        return not self.quick and bool(any(given) or any(self.stiffness.values()))
+
+    @property
+    def solutions(self) -> tuple[int, int]:
+        """Number of whole further solutions of a material set, and of those that start from another, about."""
+        whole = bool(self.mesh) + 2 * bool(self.direction_deg)
+        moved = 2 * bool(self.labels_voxels)
+        changed = sum(map(bool, (self.force or self.force_n, self.poisson, *self.stiffness.values())))
+        return whole, changed + moved

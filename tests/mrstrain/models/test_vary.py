@@ -1,0 +1,83 @@
+"""Further solutions of a material set: one for each uncertain input, on a coarser mesh, resumed, and found again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fe
+from dvc.mesh import TetMesh
+from mrstrain.models.simulate import simulate
+from mrstrain.models.variant_files import variant_folders
+from mrstrain.models.vary import vary
+from mrstrain.options import modelling as options
+from mrstrain.options.uncertainty import Uncertainty
+from tests.blocks import block
+from validate import read_result
+
+LOADS = (fe.LoadStep("Load2", 4.0), fe.LoadStep("Load3", 4.0, 1.0))
+NORMAL, SHEAR = (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+
+
+def pad(place: Path, layers: int) -> Path:
+    """A block of fat on skin, with bone behind; x is the thickness, in so many layers of cells."""
+    made = block((layers, 2 * layers, 2 * layers), (16.0, 32.0, 32.0), layers=4)
+    fat = np.concatenate([made.regions[f"layer {k}"] for k in (1, 2, 3)])
+    facets = {"skin": made.facets["x0"], "bone": made.facets["x1"]}
+    mesh = TetMesh(made.points_mm, made.cells, {"fat": fat, "skin": made.regions["layer 0"]}, facets)
+    fe.write_tet_mesh(place, mesh, {})
+    return place
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory) -> dict[str, object]:
+    folder = tmp_path_factory.mktemp("vary")
+    fine, coarse = pad(folder / "fine.vtu", 8), pad(folder / "coarse.vtu", 4)
+    simulate(
+        fine, out=folder / "models", sets=["trebbi"], loads=LOADS, plate_normal=NORMAL, shear_direction=SHEAR,
+        workers=1, threads=1,
+    )  # fmt: skip
+    return {
+        "mesh": fine, "coarse": coarse, "out": folder / "variants", "base": folder / "models" / "trebbi",
+        "simulation": options.SimulationOptions(sets=("trebbi",)), "loads": LOADS, "towards": {},
+        "plate_options": options.PlateOptions(plate_normal=NORMAL, shear_direction=SHEAR),
+        "coordinates": options.MeshCoordinates(), "voxel_mm": 0.8,
+    }  # fmt: skip
+
+
+def spread(**inputs: object) -> Uncertainty:
+    return Uncertainty.of(inputs)
+
+
+def test_each_uncertain_input_has_a_solution_that_is_kept(given) -> None:
+    uncertain = spread(mesh=1.4, force=0.05, direction_deg=1.0, poisson=0.5, labels_voxels=0.5, stiffness={"fat": 0.2})
+    done = vary(**given, uncertainty=uncertain)
+    assert done.complete, done.lines
+    found = {one.record.input: one for one in variant_folders([given["out"]])}
+    assert set(found) == {
+        "mesh", "force", "direction-along", "direction-across", "poisson", "labels-bone", "labels-skin", "stiffness-fat"
+    }  # fmt: skip
+    # cells twice as long, an assumed order of 1, and a safety factor of 1.25 on the interval of k = 2
+    assert found["mesh"].record.steps == pytest.approx(2.0 * (2.0 - 1.0) / 1.25)
+    assert found["mesh"].base is None
+    assert {one.base.resolve() for name, one in found.items() if name != "mesh"} == {found["mesh"].place.resolve()}
+    # each changed solution carries its own load, and strains the pad otherwise
+    shear = {name: read_result(name, one.place / "Load3.vtu").deformation for name, one in found.items()}
+    moved = {name: float(np.abs(of.u_mm - shear["mesh"].u_mm).max()) for name, of in shear.items() if name != "mesh"}
+    assert 0.0 < min(moved.values()) < max(moved.values()) < 2.0, moved
+    written = {name: (one.place / "Load2.vtu").stat().st_mtime_ns for name, one in found.items()}
+    # only what changed is solved again
+    vary(**given, uncertainty=uncertain.model_copy(update={"poisson": 0.4}))
+    again = {name: (one.place / "Load2.vtu").stat().st_mtime_ns for name, one in found.items()}
+    short = {"force", "poisson", "labels-bone", "labels-skin", "stiffness-fat"}
+    assert {name for name in short if written[name] != again[name]} == {"poisson"}
+
+
+def test_without_a_coarser_mesh_the_states_of_the_model_itself_are_used(given, tmp_path) -> None:
+    alone = {**given, "coarse": None, "out": tmp_path / "variants"}
+    done = vary(**alone, uncertainty=spread(mesh=1.4, force=0.05))
+    (found,) = variant_folders([alone["out"]])
+    assert done.complete, done.lines
+    assert (found.record.input, found.record.steps, found.base) == ("force", 1.0, None)
