@@ -10,6 +10,7 @@ import numpy as np
 from dvc import LabelMap, label_tissues, read_image, read_labels, read_mask, write_labels, write_vectors
 from dvc.atomic_files import write_json
 from dvc.errors import InputError
+from dvc.labelling.marks import MARKED
 from dvc.report.drawing import Drawing
 from dvc.report.labels import label_slices
 from dvc.report.page import Section, Table
@@ -18,8 +19,6 @@ from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volu
 from mrstrain.options.door import door
 from mrstrain.options.measurement import BoneAndBody, DrawnLabels, Marks
 from mrstrain.records.provenance import file_hash, provenance
-
-_USUAL = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon"}  # marks without names
 
 
 @door
@@ -89,11 +88,11 @@ def read_marks(path: Path, names: Path | None) -> LabelMap:
     """Marks with the names of a table, of the file itself, or the usual ones of their numbers."""
     marks = read_labels(path, names)
     if names is None and all(name == f"label-{number}" for number, name in marks.names.items()):
-        if unknown := [number for number in marks.names if number not in _USUAL]:
-            usual = ", ".join(f"{number} {name}" for number, name in _USUAL.items())
+        if unknown := [number for number in marks.names if number not in MARKED]:
+            usual = ", ".join(f"{number} {name}" for number, name in MARKED.items())
             raise InputError(
                 f"{path}: the marks {unknown} have no name. Give a table of names (mark_names), or use the usual "
                 f"numbers: {usual}."
             )
-        return replace(marks, names={number: _USUAL[number] for number in marks.names})
+        return replace(marks, names={number: MARKED[number] for number in marks.names})
     return marks
