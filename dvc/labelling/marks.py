@@ -12,8 +12,6 @@ from dvc.images.image import Grid, Mask
 from dvc.images.tissue import within
 from dvc.labelling.brightness import Levels, brighter_share
 
-MARKED = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "other"}
-"""Names of marks that have none of their own, by number; "other" is any tissue that stands out from muscle."""
 _BORDER_MM = 0.1  # of a marked tissue, which may be a sheet of two voxels
 _REACH_MM = 8.0  # of a correction
 _BLUR_MM = 0.5

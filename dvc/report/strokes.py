@@ -9,11 +9,12 @@ import numpy as np
 
 from dvc.atomic_files import write_whole
 from dvc.images.image import Grid, Image
-from dvc.labelling.marks import MARKED
 from dvc.report.html import packed, policy, stored, template
 from dvc.report.sheet import AXES, LETTERS, PLANES, Plane, tilt_deg
 from dvc.report.style import TISSUES, looks
 
+MARKED = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "other"}
+"""Names of marks that have none of their own, by number; "other" is any tissue that stands out from muscle."""
 STROKES = "strokes.nii.gz"
 """The file that the page saves."""
 _GREYS = 64  # steps of the image: with its noise, 256 take half as much room again
@@ -23,7 +24,7 @@ _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def write_strokes_page(path: Path, name: str, image: Image) -> None:
-    """Write a page on which strokes of tissues (`dvc.labelling.marks.MARKED`) are drawn on an image.
+    """Write a page on which strokes of tissues (`MARKED`) are drawn on an image.
 
     One HTML file without anything to fetch. A browser saves the strokes as NIfTI: 8 bits, on the image's grid, voxel
     by voxel as they were drawn. Slices are cut along the image's own axes and shown as radiologists read them.

@@ -11,7 +11,7 @@ from mrstrain.cli.lines import say
 from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
 from mrstrain.options.measurement import (
     BoneAndBody,
-    DrawnLabels,
+    GivenLabels,
     Marks,
     MeshAndAxes,
     RegistrationOptions,
@@ -40,9 +40,12 @@ def label(
             rich_help_panel="Output",
         ),
     ] = None,
-    masks: BoneAndBody, strokes: Marks, drawn: DrawnLabels,
+    masks: BoneAndBody, strokes: Marks, drawn: GivenLabels,
 ) -> None:  # fmt: skip
-    """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks."""
+    """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks.
+
+    Or carry another subject's label map over (--from with --labels), or correct one of this image (--labels alone).
+    """
     from dvc.errors import InputError
 
     if draw is not None:
