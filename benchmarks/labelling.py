@@ -2,12 +2,15 @@
 
     python -m benchmarks.labelling --seeds 41 42 43 --out labelling.json
     python -m benchmarks.labelling --seeds 41 42 --motions smooth sliding Load1 Load3 --out labelling.json
+    python -m benchmarks.labelling --seeds 41 42 --carried-from 1 --out labelling.json
 
 Heels at 0.8 mm and SNR 25, labelled from the mask of the bone, and from ten strokes of 12 mm at random places (bone,
 4 in fat, 3 in muscle, 2 in skin). Dice coefficients by tissue (tendon counts as muscle, and other bones as one), the
 distance (mm) from the border of skin to the true one, and seconds on one thread. With motions, pairs are registered
 with the exact labels, with those from the bone's mask, and without; root mean square errors of the max. shear by
-tissue. Results are added to those that the file holds.
+tissue. With another heel's seed, its labels are carried over to heels of the same size, and to ones that are a twelfth
+larger with a thinner pad and skin: by registration alone, corrected by the image, and in all (`dvc.labels_from`);
+overlap by tissue, share of wrong labels, and distance of surfaces (mm). Results are added to those that the file holds.
 """
 
 from __future__ import annotations
@@ -21,14 +24,16 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.engines import ENGINES, errors, motion_of
-from dvc import LabelMap, Mask, TissueLabels, label_tissues, register, tissue_mask
-from dvc.arrays import BoolArray
+from dvc import Image, LabelMap, Mask, TissueLabels, correct_labels, label_tissues, register, tissue_mask
+from dvc.arrays import BoolArray, FloatArray
 from dvc.images.depth import depth_mm
+from dvc.labelling.carried import carry_labels, combined
 from mrstrain.records.provenance import versions
-from phantoms import Heel, HeelPair, heel_grid, heel_pair, labels_of, scan
+from phantoms import TISSUES, Heel, HeelPair, heel_grid, heel_pair, labels_of, random_foot_motion, scan
 
 STROKES = {"bone": 1, "fat": 4, "muscle": 3, "skin": 2}
 STROKE_MM = 12.0
+OTHER_SHAPE = {"size": 1.08, "pad_mm": 14.0, "skin_mm": 1.5}
 
 
 def strokes(labels: LabelMap, seed: int) -> LabelMap:
@@ -78,6 +83,42 @@ def labelled(seed: int) -> dict[str, object]:
     return rows
 
 
+def surface_off(found: BoolArray, true: BoolArray, spacing_mm: FloatArray) -> float:
+    """Root mean square distance from the true surface of a tissue to that of one found, mm."""
+    at_border = np.abs(depth := depth_mm(true, spacing_mm)) < 0.5 * float(spacing_mm.mean())
+    return float(np.sqrt(np.mean((depth_mm(found, spacing_mm) - depth)[at_border] ** 2)))
+
+
+def carried(seed: int, other: int, shape: dict[str, float]) -> dict[str, object]:
+    """Labels of one heel carried over to another, whose foot lies otherwise."""
+    heel, theirs = Heel(seed, **shape), Heel(other)
+    grid, foot = heel_grid(0.8, heel.size), random_foot_motion(other, 5)
+    image, truth = scan(heel, grid, snr=25.0, number=0), labels_of(heel, grid)
+    first = scan(theirs, heel_grid(0.8), snr=25.0, number=0)
+    moved = first.grid.moved_by(foot.rotation, foot.translation_mm)
+    drawn = LabelMap(moved, labels_of(theirs, first.grid).labels, TISSUES)
+    began, scanned, body = time.process_time(), Image(moved, first.values), tissue_mask(image)
+    over = carry_labels(image, scanned, drawn, body)
+    made = combined(image, scanned, drawn, over, None, body)  # as `dvc.labels_from` does
+    rows: dict[str, object] = {"seed": seed, "from": other, "shape": shape, "processor_s": time.process_time() - began}
+    rows |= {"unsure": made.unsure, "notes": made.notes}
+    corrected, alone = correct_labels(image, over.labels).labels, label_tissues(image, truth.region("bone")).labels
+    ways = {"registration": over.labels, "corrected": corrected, "all": made.labels, "bone": alone}
+    labelled = truth.labels > 0
+    for way, labels in ways.items():
+        found = {name.replace("other bone", "ankle"): labels.labels == n for n, name in labels.names.items()}
+        same = np.zeros_like(labelled)
+        for name, where in found.items():
+            same |= where & (truth.labels == next(n for n, one in TISSUES.items() if one == name))
+        told: dict[str, float] = {"wrong": float(np.mean(~same[labelled]))}
+        for name, where in found.items():
+            true = truth.region(name).inside
+            told |= {name: dice(where, true), f"{name}_surface_mm": surface_off(where, true, grid.spacing_mm)}
+        rows[way] = told
+        print(seed, shape, way, {key: round(value, 3) for key, value in told.items()}, flush=True)
+    return rows
+
+
 def measured(pair: HeelPair, seed: int, motion: str) -> list[dict[str, object]]:
     """Errors of the max. shear with exact labels, with labels from the bone's mask, and without labels."""
     body, exact = tissue_mask(pair.reference), Mask(pair.labels.grid, pair.labels.labels > 0)
@@ -102,6 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--motions", nargs="*", default=[])
+    parser.add_argument("--carried-from", type=int)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     told = json.loads(given.out.read_text()) if given.out.is_file() else {}
@@ -111,7 +153,11 @@ def main() -> None:
             pair = heel_pair(seed=seed, motion=motion_of(Heel(seed), motion))
             told.setdefault("strain", []).extend(measured(pair, seed, motion))
             given.out.write_text(json.dumps(told, indent=1) + "\n")
-        if not given.motions:
+        if given.carried_from is not None:
+            for shape in ({}, OTHER_SHAPE):
+                told.setdefault("carried", []).append(carried(seed, given.carried_from, shape))
+                given.out.write_text(json.dumps(told, indent=1) + "\n")
+        elif not given.motions:
             told.setdefault("labels", []).append(labelled(seed))
             given.out.write_text(json.dumps(told, indent=1) + "\n")
 

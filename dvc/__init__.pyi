@@ -21,6 +21,7 @@ from .io.images.write import write_image, write_labels, write_mask, write_vector
 from .io.meshes.read import MeshFile, read_mesh
 from .io.transforms.read import read_displacement, read_transform
 from .labelling.boundaries import correct_labels
+from .labelling.carried import labels_from
 from .labelling.tissues import TissueLabels, label_tissues
 from .measurement.judgement import Evidence
 from .measurement.measure import measure
@@ -46,8 +47,8 @@ __all__ = [
     "LabelMap", "Mask", "Measurement", "MeshFile", "Preset", "Quality", "Registration", "RigidMotion",
     "SampledDisplacement", "Settings", "Similarity", "StrainField", "StrainMaps", "Subject", "TetMesh", "TissueLabels",
     "Verdict", "Within", "assess", "correct_labels", "engine_named", "errors", "evaluate_on_grid", "fit_mask",
-    "label_tissues", "load_preset", "local_correlation", "measure", "noise_floor", "plate_axes", "preset_names",
-    "principal_values",
+    "label_tissues", "labels_from", "load_preset", "local_correlation", "measure", "noise_floor", "plate_axes",
+    "preset_names", "principal_values",
     "read_displacement", "read_error_model", "read_image", "read_labels", "read_landmarks", "read_mask", "read_mesh",
     "read_parameter_file", "read_transform", "register", "strain_maps", "target_registration_error", "tissue_mask",
     "write_image", "write_labels", "write_mask", "write_vectors",

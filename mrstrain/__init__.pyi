@@ -1,6 +1,7 @@
 from .comparison.compare import compare
 from .comparison.drive import drive
 from .comparison.level import level
+from .measurement.draw_strokes import draw_strokes
 from .measurement.label import label
 from .measurement.register import register
 from .measurement.strain import strain
@@ -18,6 +19,6 @@ from .truth.twin import twin
 
 __version__: str
 __all__ = [
-    "accuracy", "accuracy_cases", "check", "cohort", "compare", "converge", "drive", "fit", "init", "label", "level",
-    "mesh", "phantom", "register", "run", "simulate", "strain", "twin",
+    "accuracy", "accuracy_cases", "check", "cohort", "compare", "converge", "draw_strokes", "drive", "fit", "init",
+    "label", "level", "mesh", "phantom", "register", "run", "simulate", "strain", "twin",
 ]  # fmt: skip

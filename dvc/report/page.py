@@ -1,18 +1,14 @@
 """The building blocks of a report page: verdicts, tables, figures and volumes in one self-contained HTML file."""
 
 import base64
-import gzip
-import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Self
 
-import jinja2
 import nibabel
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +17,7 @@ from PIL import Image as Pixels
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.report.html import packed, policy, stored, template
 from dvc.threads import usable_cores
 from dvc.trust.verdict import Level, Verdict
 
@@ -136,7 +133,7 @@ class Volume:
         known, step = np.nan_to_num(np.asarray(values, dtype=np.float64)), most / steps
         image = nibabel.Nifti1Image(np.clip(np.rint(known / step), 0, 255).astype(np.uint8), _TO_RAS @ grid.affine)
         image.header.set_slope_inter(step, 0.0)
-        return cls(title, _packed(image.to_bytes()), most)
+        return cls(title, packed(image.to_bytes()), most)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,11 +189,6 @@ def _line(value: object) -> str:
     return str(value)
 
 
-def _packed(content: bytes) -> str:
-    """Compressed, in base64; equal contents give equal text."""
-    return base64.b64encode(gzip.compress(content, mtime=0)).decode()
-
-
 @lru_cache(maxsize=256)
 def _small(png: bytes) -> str:
     with Pixels.open(io.BytesIO(png)) as picture:
@@ -207,32 +199,10 @@ def _small(png: bytes) -> str:
 
 @cache
 def _library() -> Mapping[str, str]:
-    """The viewer: its library, compressed, which a page unpacks and runs when a viewer is asked for, and its script."""
-    code = _stored("niivue.umd.js")
-    notice = f"/* niivue {NIIVUE}\n{_stored('niivue-LICENSE.txt')}*/\n"
-    return {"packed": _packed(code.encode()), "script": notice + _stored("viewer.js"), "hash": _hash(code)}
-
-
-def _hash(content: str) -> str:
-    """A script or style of a page as its content security policy names it."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
-
-
-def _policy(style: str, script: str, library: Mapping[str, str] | None) -> str:
-    """What a browser lets a page do: run and apply what was written here, by its hash, and fetch nothing."""
-    scripts, more = _hash(script), ""
-    if library:
-        scripts += f" {_hash(library['script'])} {library['hash']} 'wasm-unsafe-eval'"
-        more = "; worker-src blob:; connect-src data: blob:"
-    images = "data: blob:" if library else "data:"
-    return (
-        f"default-src 'none'; base-uri 'none'; form-action 'none'; img-src {images}; style-src {_hash(style)}; "
-        f"script-src {scripts}{more}"
-    )
-
-
-def _stored(name: str) -> str:
-    return (files("dvc.report") / "templates" / name).read_text(encoding="utf-8")
+    """The viewer: its library, and the same compressed, which a page unpacks and runs when a viewer is asked for."""
+    code = stored("niivue.umd.js")
+    notice = f"/* niivue {NIIVUE}\n{stored('niivue-LICENSE.txt')}*/\n"
+    return {"code": code, "packed": packed(code.encode()), "script": notice + stored("viewer.js")}
 
 
 def write_report(
@@ -261,10 +231,11 @@ def write_report(
     pictures = [picture for section in (*sections, *closing) for picture in section.pictures]
     with ThreadPoolExecutor(usable_cores()) as pool:  # which the template then finds done
         list(pool.map(_small, (png for one in pictures for png in (one.png, *(png for _, png in one.beneath)))))
-    style, script, library = _stored("page.css"), _stored("page.js"), _library() if volumes else None
-    page = _template("report").render(
+    style, script, library = stored("page.css"), stored("page.js"), _library() if volumes else None
+    scripts = [script, library["script"], library["code"]] if library else [script]
+    page = template("report", shown=shown).render(
         **told, sections=sections, volumes=volumes, style=style, script=script, library=library,
-        policy=_policy(style, script, library), reload_s=reload_s, beneath={},
+        policy=policy(style, scripts, viewer=bool(volumes)), reload_s=reload_s, beneath={},
     )  # fmt: skip
     write_whole(path, page)
 
@@ -274,12 +245,4 @@ def notebook_html(
 ) -> str:
     """What a notebook shows of a result: a headline with the verdict, if there is one, a picture, a table, notes."""
     told = {"headline": headline, "picture": picture, "table": table, "verdict": verdict, "notes": notes}
-    return _template("notebook").render(**told, tones=_TONES)
-
-
-def _template(name: str) -> jinja2.Template:
-    """A template that escapes all text and refuses what is not given."""
-    strict = jinja2.StrictUndefined
-    environment = jinja2.Environment(autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["shown"] = shown
-    return environment.from_string(_stored(f"{name}.html.j2"))
+    return template("notebook", shown=shown).render(**told, tones=_TONES)

@@ -50,6 +50,13 @@ def letters(direction: npt.ArrayLike) -> str:
     return "".join(_SIDES[axis][int(unit[axis] > 0.0)] for axis in shown)
 
 
+def tilt_deg(grid: Grid, plane: Plane) -> float:
+    """Angle between the plane and the grid's slices that are shown for it, degrees; 0 where it is not worth telling."""
+    cut = AXES[plane][0]
+    tilt = float(np.degrees(np.arccos(np.clip(grid.toward_lps().direction[cut, cut], -1.0, 1.0))))
+    return tilt if tilt > OBLIQUE_DEG else 0.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
     """Which slices of a grid are shown, and how much of them."""
@@ -105,8 +112,7 @@ class View:
     def title(self, plane: Plane) -> str:
         """The plane with the position of the cut, or with the tilt of oblique axes."""
         lps, cut = self.grid.toward_lps(), AXES[plane][0]
-        tilt = float(np.degrees(np.arccos(np.clip(lps.direction[cut, cut], -1.0, 1.0))))
-        if tilt > OBLIQUE_DEG:
+        if tilt := tilt_deg(self.grid, plane):
             return f"{plane.capitalize()}, along image axes (tilted {tilt:.0f}°)"
         at = lps.points_at(np.array(self.index, dtype=np.float64))[cut]
         return f"{plane.capitalize()}, {'xyz'[cut]} = {at:z.0f} mm".replace("-", "\u2212")

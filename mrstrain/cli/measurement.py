@@ -11,7 +11,7 @@ from mrstrain.cli.lines import say
 from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
 from mrstrain.options.measurement import (
     BoneAndBody,
-    DrawnLabels,
+    GivenLabels,
     Marks,
     MeshAndAxes,
     RegistrationOptions,
@@ -29,17 +29,38 @@ SliceSpacing = Annotated[
 @takes_options
 def label(
     load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, enhanced DICOM, or a DICOM folder.")],
-    out: Annotated[Path, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.")], masks: BoneAndBody,
-    strokes: Marks, drawn: DrawnLabels,
+    *,
+    out: Annotated[
+        Path | None, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.", rich_help_panel="Output")
+    ] = None,
+    draw: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write only a page (.html) on which strokes for --marks are drawn in a browser, offline.",
+            rich_help_panel="Output",
+        ),
+    ] = None,
+    masks: BoneAndBody, strokes: Marks, drawn: GivenLabels,
 ) -> None:  # fmt: skip
-    """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks."""
+    """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks.
+
+    Or carry another subject's label map over (--from with --labels), or correct one of this image (--labels alone).
+    """
+    from dvc.errors import InputError
+
+    if draw is not None:
+        if out is not None or masks.paths or strokes.paths or drawn.paths:
+            raise InputError("--draw writes only the page to draw on: give it without --out and other files.")
+        return tell(mrstrain.draw_strokes(load0, out=draw))
+    if out is None:
+        raise InputError("Give the label map to write: --out tissues.nii.gz (or a page to draw on: --draw page.html).")
     from mrstrain.records.progress import live
 
     with live() as progress:
         done = mrstrain.label.with_options(
             load0, out=out, masks=masks, strokes=strokes, drawn=drawn, watch=partial(progress, "label", "tissues")
         )
-    tell(done)
+    return tell(done)
 
 
 @takes_options

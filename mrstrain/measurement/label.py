@@ -1,4 +1,4 @@
-"""`label`: a label map from the unloaded image and a mask of its bone, from marks, or a drawn one with corrections."""
+"""`label`: a label map from the unloaded image with its bone, marks, or another subject's labels; or one corrected."""
 
 import time
 from collections.abc import Callable
@@ -7,27 +7,39 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import LabelMap, label_tissues, read_image, read_labels, read_mask, write_labels, write_vectors
+from dvc import (
+    Image,
+    LabelMap,
+    Mask,
+    TissueLabels,
+    label_tissues,
+    labels_from,
+    read_image,
+    read_labels,
+    read_mask,
+    write_labels,
+    write_vectors,
+)
 from dvc.atomic_files import write_json
 from dvc.errors import InputError
+from dvc.registration.register import refuse_one_image_twice
 from dvc.report.drawing import Drawing
 from dvc.report.labels import label_slices
 from dvc.report.page import Section, Table
+from dvc.report.strokes import MARKED
 from mrstrain.measurement.correct import corrected
 from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volumes_ml
 from mrstrain.options.door import door
-from mrstrain.options.measurement import BoneAndBody, DrawnLabels, Marks
+from mrstrain.options.measurement import BoneAndBody, GivenLabels, Marks
 from mrstrain.records.provenance import file_hash, provenance
-
-_USUAL = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon"}  # marks without names
 
 
 @door
 def label(
-    load0: Path | str, *, out: Path | str, masks: BoneAndBody, strokes: Marks, drawn: DrawnLabels,
+    load0: Path | str, *, out: Path | str, masks: BoneAndBody, strokes: Marks, drawn: GivenLabels,
     watch: Callable[[float], None] | None = None,
 ) -> Labelled:  # fmt: skip
-    """Label skin, fat, muscle and other bones of an unloaded image, or correct the boundaries of a label map.
+    """Label skin, fat, muscle and bones of an unloaded image, or correct the boundaries of its label map.
 
     Parameters
     ----------
@@ -37,9 +49,10 @@ def label(
         The label map. Beside it are written the names (.csv), a picture (.png, .pdf), a record (.json), and, unless a
         label map is corrected, the probability of each tissue (STEM_probability).
     masks, strokes
-        The bone, or the mark of one, is required; as in `dvc.label_tissues`.
+        The bone, or the mark of one, is required, unless ``labels`` are given; as in `dvc.label_tissues`.
     drawn
-        A label map to be corrected, instead; as in `dvc.correct_labels`.
+        Instead, ``labels`` of this image, which are corrected as in `dvc.correct_labels`; or ``labels`` of another
+        subject's image (``from_image``), which are carried over as in `dvc.labels_from`.
     watch
         As in `dvc.label_tissues`.
 
@@ -51,18 +64,19 @@ def label(
     """
     source, tell = Path(load0), watch or (lambda _: None)
     files = LabelFiles.of(out, (source, *masks.paths, *strokes.paths, *drawn.paths))
-    if drawn.labels is not None:
+    if drawn.labels is not None and drawn.from_image is None:
         if masks.paths or strokes.paths:
             raise InputError("A label map (labels) is corrected by the image alone: give it without masks or marks.")
         return corrected(source, drawn.labels, drawn.names, files, tell)
-    if drawn.names is not None:
-        raise InputError("names are those of a label map (labels), which is not given. For marks, use mark_names.")
     began, image = time.perf_counter(), read_image(source)
     bone, body = (None if one is None else read_mask(one, image.grid) for one in (masks.bone, masks.tissue))
-    marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
-    made = label_tissues(image, bone, body, marks, tell)
+    if drawn.paths:
+        made = _from_another(image, bone, body, strokes, drawn, tell)
+    else:
+        marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
+        made = label_tissues(image, bone, body, marks, tell)
     names = tuple(made.labels.names.values())
-    inputs = {"load0": source, **{role: of[0] for role, of in (masks.files | strokes.files).items()}}
+    inputs = {"load0": source, **{role: of[0] for role, of in (masks.files | strokes.files | drawn.files).items()}}
     found = {"unsure": made.unsure, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
     with files.alone():
         write_labels(files.labels, made.labels)
@@ -78,22 +92,39 @@ def label(
     unsure = f"{100 * made.unsure:.0f} % of the voxels are unsure (probability below 90 %)"
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
     lines = (told, f"{unsure}; {files.picture} shows where.", *made.notes, f"Label map: {files.labels}")
+    made_from = f"Label map made from {'another subject' if drawn.paths else 'the image'}"
     table = Table("Volumes", ("tissue", "volume, mL"), tuple(volumes.items()))
-    section = Section(
-        "Label map made from the image", None, (table,), (picture,), (f"{unsure}.", *made.notes), pictures_first=True
-    )
+    section = Section(made_from, None, (table,), (picture,), (f"{unsure}.", *made.notes), pictures_first=True)
     return Labelled(files.labels, lines, headline=f"{', '.join(volumes)}; {unsure}", section=section)
+
+
+def _from_another(
+    image: Image, bone: Mask | None, body: Mask | None, strokes: Marks, drawn: GivenLabels,
+    tell: Callable[[float], None],
+) -> TissueLabels:  # fmt: skip
+    """Labels of another subject carried over to the image."""
+    if drawn.labels is None:
+        what = "names are those of a label map" if drawn.from_image is None else "from_image needs its label map"
+        raise InputError(f"{what} (labels), which is not given. For marks, use mark_names.")
+    if strokes.paths:
+        raise InputError(
+            "Give marks or another subject's labels, not both. Where the labels come out wrong, correct them by hand."
+        )
+    assert drawn.from_image is not None
+    other, theirs = read_image(drawn.from_image), read_labels(drawn.labels, drawn.names)
+    refuse_one_image_twice([("The image to label", image), ("the other subject's", other)])
+    return labels_from(image, other, theirs, bone, body, tell)
 
 
 def read_marks(path: Path, names: Path | None) -> LabelMap:
     """Marks with the names of a table, of the file itself, or the usual ones of their numbers."""
     marks = read_labels(path, names)
     if names is None and all(name == f"label-{number}" for number, name in marks.names.items()):
-        if unknown := [number for number in marks.names if number not in _USUAL]:
-            usual = ", ".join(f"{number} {name}" for number, name in _USUAL.items())
+        if unknown := [number for number in marks.names if number not in MARKED]:
+            usual = ", ".join(f"{number} {name}" for number, name in MARKED.items())
             raise InputError(
                 f"{path}: the marks {unknown} have no name. Give a table of names (mark_names), or use the usual "
                 f"numbers: {usual}."
             )
-        return replace(marks, names={number: _USUAL[number] for number in marks.names})
+        return replace(marks, names={number: MARKED[number] for number in marks.names})
     return marks

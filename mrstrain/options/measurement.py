@@ -45,21 +45,26 @@ class Marks(Options):
     panel: ClassVar[str] = "Inputs"
 
     marks: Path | None = None
-    """Label map of a few strokes in each tissue, from ITK-SNAP, 3D Slicer (.seg.nrrd) or any other program."""
+    """Label map of a few strokes in each tissue, from the page of --draw, ITK-SNAP, 3D Slicer (.seg.nrrd) or any other
+    program."""
     mark_names: Path | None = None
-    """Table of the names of the marks: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon."""
+    """Table of the names of the marks: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon, 6
+    other."""
 
 
-class DrawnLabels(Options):
-    """A label map of the unloaded image that was drawn, to be corrected."""
+class GivenLabels(Options):
+    """A label map that was drawn: of this image, to be corrected, or of another subject's, to be carried over."""
 
     panel: ClassVar[str] = "Inputs"
 
     labels: Path | None = None
-    """Label map to correct, instead of --bone and --marks: the boundaries of its bones and skin move to where the image
-    shows them, by up to 2.5 voxels."""
+    """A label map. Without --from, of this image, to be corrected: the boundaries of its bones and skin move to where
+    the image shows them, by up to 2.5 voxels. With --from, of that image, to be carried over to this one."""
     names: Path | None = None
     """Table of its label names: ITK-SNAP, Slicer or CSV."""
+    from_image: Annotated[Path | None, Cli(name="--from")] = None
+    """Unloaded image of another subject (same part and side of the body, same contrast), whose label map is --labels.
+    The two images are registered; --bone is not needed."""
 
 
 class SubjectFiles(BoneAndBody):

@@ -8,12 +8,14 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import mrstrain
 from dvc import Image, LabelMap, read_image, read_labels, read_mask, write_image, write_labels, write_mask
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_names
 from dvc.measurement.subject import LabelsFromImage
+from mrstrain.cli.app import app
 from mrstrain.measurement.label import read_marks
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import made_from_image, read_subject
@@ -146,3 +148,46 @@ def test_what_is_corrected_needs_no_mask_and_names_need_labels(folder: Path, tmp
     with pytest.raises(InputError, match="names are those of a label map"):
         mrstrain.label(load0, bone=bone, names=tmp_path / "names.csv", out=out)
     assert not list(tmp_path.iterdir())
+
+
+def test_another_subjects_labels_are_carried_over_and_counted_as_made(folder: Path, tmp_path: Path) -> None:
+    load0, other, theirs = folder / "Load0.nii.gz", tmp_path / "Other.nii.gz", tmp_path / "theirs.nii.gz"
+    heel, grid = Heel(7), heel_grid(2.4)
+    write_image(other, scan(heel, grid, snr=25.0, number=0))
+    write_labels(theirs, labels_of(heel, grid))
+    out = tmp_path / "out" / "tissues.nii.gz"
+    told = mrstrain.label(load0, from_image=other, labels=theirs, names=tmp_path / "theirs.csv", out=out)
+    assert told.section.title == "Label map made from another subject"
+    made, truth = read_labels(out, out.with_name("tissues.csv")), labels_of(Heel(41), read_image(load0).grid)
+    assert made.names == truth.names
+    assert np.mean((made.labels != truth.labels)[truth.labels > 0]) < 0.15
+    record = json.loads(out.with_name("tissues.json").read_text())
+    assert set(record["inputs"]) == {"load0", "labels", "names", "from_image"}
+    assert made_from_image(out) == LabelsFromImage(record["unsure"], tuple(record["notes"]))
+    assert out.with_name("tissues_probability.nii.gz").is_file()
+
+
+def test_what_cannot_be_carried_over_is_refused(folder: Path, tmp_path: Path) -> None:
+    load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "t.nii.gz"
+    with pytest.raises(InputError, match="from_image needs its label map"):
+        mrstrain.label(load0, from_image=load0, out=out)
+    with pytest.raises(InputError, match="not both"):
+        mrstrain.label(load0, from_image=load0, labels=bone, marks=bone, out=out)
+    with pytest.raises(InputError, match="are the same image"):
+        mrstrain.label(load0, from_image=load0, labels=bone, out=out)
+    with pytest.raises(OutputError, match="would be overwritten"):
+        mrstrain.label(load0, from_image=load0, labels=bone, out=bone)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_to_draw_on_is_written_alone(folder: Path, tmp_path: Path) -> None:
+    load0, page = folder / "Load0.nii.gz", tmp_path / "strokes.html"
+    told = mrstrain.draw_strokes(load0, out=page).summary()
+    assert "--marks strokes.nii.gz" in told[-1]
+    assert [path.name for path in tmp_path.iterdir()] == ["strokes.html"]
+    with pytest.raises(InputError, match=r"must end in \.html"):
+        mrstrain.draw_strokes(load0, out=tmp_path / "strokes.nii.gz")
+    for given in (["--draw", str(page), "--bone", str(page)], []):
+        refused = CliRunner().invoke(app, ["label", str(load0), *given])
+        assert isinstance(refused.exception, InputError)
+        assert "--out" in str(refused.exception)

@@ -20,8 +20,8 @@ from mrstrain.options import measurement, modelling
 from mrstrain.options.measurement import (
     BoneAndBody,
     Cores,
-    DrawnLabels,
     EngineOptions,
+    GivenLabels,
     Marks,
     MeshAndAxes,
     RegistrationOptions,
@@ -54,7 +54,7 @@ from validate.curves import RANGE
 from validate.location import LEAST_ML
 
 COMMANDS: dict[str, tuple[type[Options], ...]] = {
-    "label": (BoneAndBody, Marks, DrawnLabels),
+    "label": (BoneAndBody, Marks, GivenLabels),
     "register": (SubjectFiles, RegistrationOptions, Scans, MeshAndAxes, Running),
     "strain": (SubjectFiles, MeshAndAxes),
     "phantom": (HeelShape,),
@@ -82,7 +82,7 @@ TABLES: dict[type[Options], tuple[str, str]] = {  # table of the study file, and
 NOT_IN_A_STUDY = {  # what a study has in its own way
     Scans: "repeat and allow_missing are keys of [images]; a start and landmarks belong to a single load",
     Marks: "marks are keys of [images]",
-    DrawnLabels: "a drawn label map is corrected before a study",
+    GivenLabels: "a label map is corrected or carried over before a study",
     BoneAndBody: "part of SubjectFiles",
     MeshAndAxes: "its directions are the plate's",
     Cores: "told when it is run",

@@ -1,0 +1,45 @@
+"""What every page of this package is made of: its templates, its scripts by their hashes, and what it may not do."""
+
+import base64
+import gzip
+import hashlib
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+
+import jinja2
+
+
+def stored(name: str) -> str:
+    """The text of a file that comes with the package."""
+    return (files("dvc.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def template(name: str, **filters: Callable[..., object]) -> jinja2.Template:
+    """A template that escapes all text and refuses what is not given, with filters of its own."""
+    strict = jinja2.StrictUndefined
+    environment = jinja2.Environment(autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= filters
+    return environment.from_string(stored(f"{name}.html.j2"))
+
+
+def packed(content: bytes) -> str:
+    """Compressed, in base64; equal contents give equal text."""
+    return base64.b64encode(gzip.compress(content, mtime=0)).decode()
+
+
+def policy(style: str, scripts: Sequence[str], *, viewer: bool = False) -> str:
+    """What a browser lets a page do: run and apply what was written here, by its hash, and fetch nothing.
+
+    A page with the 3-D ``viewer`` also compiles WebAssembly, and reads what it unpacked itself.
+    """
+    run = " ".join([*map(_hash, scripts), *(["'wasm-unsafe-eval'"] if viewer else [])])
+    images, more = ("data: blob:", "; worker-src blob:; connect-src data: blob:") if viewer else ("data:", "")
+    return (
+        f"default-src 'none'; base-uri 'none'; form-action 'none'; img-src {images}; style-src {_hash(style)}; "
+        f"script-src {run}{more}"
+    )
+
+
+def _hash(content: str) -> str:
+    """A script or style of a page as its content security policy names it."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
