@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import fe
+from dvc.images.image import Grid, LabelMap
 from dvc.mesh import TetMesh
+from mrstrain.models.mesh import _coarser
 from mrstrain.models.simulate import simulate
 from mrstrain.models.variant_files import variant_folders
 from mrstrain.models.vary import vary
@@ -45,6 +47,20 @@ def given(tmp_path_factory) -> dict[str, object]:
         "plate_options": options.PlateOptions(plate_normal=NORMAL, shear_direction=SHEAR),
         "coordinates": options.MeshCoordinates(), "voxel_mm": 0.8,
     }  # fmt: skip
+
+
+def test_larger_voxels_have_the_labels_of_the_same_place() -> None:
+    grid = Grid((24, 20, 22), np.array([0.8, 0.8, 1.0]), np.array([3.0, -2.0, 7.0]))
+    points = grid.points()
+    middle = points.reshape(-1, 3).mean(axis=0)
+    ball = LabelMap(grid, (np.linalg.norm(points - middle, axis=-1) < 6.0).astype(np.int64), {1: "fat"})
+    made = _coarser(ball, 1.5)
+    assert made.grid.spacing_mm == pytest.approx(1.5 * grid.spacing_mm)
+    assert (made.grid.shape, made.names) == ((16, 13, 14), ball.names)
+    before, after = (of.grid.points(of.labels == 1) for of in (ball, made))
+    assert after.mean(axis=0) == pytest.approx(before.mean(axis=0), abs=0.2)
+    assert len(after) * made.grid.voxel_volume_mm3 == pytest.approx(len(before) * grid.voxel_volume_mm3, rel=0.06)
+    assert np.ptp(after, axis=0) == pytest.approx(np.ptp(before, axis=0), abs=1.5)
 
 
 def spread(**inputs: object) -> Uncertainty:
