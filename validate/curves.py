@@ -28,7 +28,7 @@ DRAWS = 200
 """Number of true fields drawn from the error model for the curves and areas of a load."""
 
 _GRID = 301
-_SURE = 0.975
+_UNSURE, _SURE = 0.025, 0.975
 _EVERY = 4  # every so many draws, one serves as a perfect model
 
 
@@ -163,13 +163,13 @@ class Band:
 
         Only the part of the measurement is widened; the widening was determined for it.
         """
-        (low, middle, high), (less, more) = np.quantile(drawn, [1.0 - _SURE, 0.5, _SURE]), self._spread(added)
+        (low, middle, high), (less, more) = np.quantile(drawn, [_UNSURE, 0.5, _SURE]), self._spread(added)
         below, above = self.widening * (middle - low), self.widening * (high - middle)
         return float(middle - np.hypot(below, less)), float(middle), float(middle + np.hypot(above, more))
 
     @staticmethod
     def _spread(added: FloatArray) -> tuple[float, float]:
-        less, more = np.quantile(added, [1.0 - _SURE, _SURE])
+        less, more = np.quantile(added, [_UNSURE, _SURE])
         return max(-float(less), 0.0), max(float(more), 0.0)
 
 

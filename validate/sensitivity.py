@@ -92,10 +92,6 @@ class Sensitivity:
         """Change (n,) of the maximum shear strain in a draw."""
         return np.asarray(self.numbers[number] @ self._stacked)
 
-    def within(self, cells: BoolArray) -> "Sensitivity":
-        """The same in some of the cells (n,)."""
-        return Sensitivity({name: of[cells] for name, of in self.changes.items()}, self.numbers)
-
 
 def changes_of(
     model: OnMesh, variants: Iterable[Variant], points_mm: FloatArray, volumes_ml: FloatArray,

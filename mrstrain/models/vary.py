@@ -4,6 +4,7 @@ All are computed on a coarser mesh if there is one, and each is compared with th
 gives the error of the discretisation. Solutions with another force, material or interface start from its states.
 """
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -85,6 +86,7 @@ def vary(
     )  # fmt: skip
     changed, lines = _changes(setting, uncertainty, voxel_mm)
     whole = ({} if coarse is None else {MESH: dict(towards)}) | _tilts(setting, uncertainty)
+    _remove_others(out, [*whole, *changed])
     solving = simulation.model_copy(update={"decks": False})
     complete, work = True, len(whole) + _SHORT * len(changed)
     for number, (name, directions) in enumerate(whole.items()):
@@ -118,6 +120,13 @@ def vary(
         *lines, *failed,
     ]  # fmt: skip
     return Outcome(out, tuple(lines), complete and not failed and len(states) == len(loads))
+
+
+def _remove_others(out: Path, names: Sequence[str]) -> None:
+    """Remove solutions of inputs that are exact by now, which would be compared otherwise."""
+    for place in out.iterdir() if out.is_dir() else ():
+        if place.is_dir() and place.name not in names:
+            shutil.rmtree(place)
 
 
 def _solve_short(
@@ -225,12 +234,12 @@ def _states(setting: _Setting, folder: Path) -> dict[str, fe.Checkpoint]:
 def solve_from_base(problems: Sequence[fe.Problem], states: Mapping[str, fe.Checkpoint], folder: Path) -> None:
     """Solve changed problems in a worker, and write a VTU file for each load that is reached."""
     folder.mkdir(parents=True, exist_ok=True)
+    for earlier in folder.glob("*.vtu"):
+        earlier.unlink()
     for problem in problems:
         for state in variation.from_base(problem, states, fe.SolverOptions(1)):
-            place = folder / f"{state.load.name}.vtu"
-            place.unlink(missing_ok=True)
             if state.reached == 1.0:
-                fe.write_state(place, problem.mesh, state, problem.materials)
+                fe.write_state(folder / f"{state.load.name}.vtu", problem.mesh, state, problem.materials)
 
 
 def _is_made(folder: Path, made_from: Sequence[str], states: Mapping[str, fe.Checkpoint]) -> bool:

@@ -116,7 +116,9 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
 def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
     """Approximate disk space for the results of a stage; parameters as in `seconds_of`."""
     images = _BYTES_VOXEL * voxels if stage.kind in ("label", "register", "level") else 0.0
-    models = {"label": 0, "register": 0, "level": 1, "mesh": 1}.get(stage.kind, len(study.loads))
+    loads = len(study.loads)
+    further = 2 * loads * sum(study.uncertainty.solutions) // 5  # on a coarser mesh
+    models = {"label": 0, "register": 0, "level": 1, "mesh": 1, "vary": further}.get(stage.kind, loads)
     return images + 1e6 * _MB_MODEL * models
 
 

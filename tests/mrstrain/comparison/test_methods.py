@@ -80,10 +80,23 @@ def levelled(folder: Path, name: str, align: str) -> Path:
     return place / "Load1.vtu"
 
 
-def told(loads: dict[str, Path], models: dict[str, Path], error_known: bool = True) -> str:
+def told(
+    loads: dict[str, Path], models: dict[str, Path], error_known: bool = True, errors: tuple[object, ...] = ()
+) -> str:
     bands = {ALL: None} if error_known else {}
     one = SimpleNamespace(fields=SimpleNamespace(points_mm=np.zeros((1234, 3))), bands=bands)
-    return "\n".join(methods(loads, models, SimpleNamespace(loads=(one,)), Criteria()))  # type: ignore[arg-type]
+    comparison = SimpleNamespace(loads=(one,), errors=errors)
+    return "\n".join(methods(loads, models, comparison, Criteria()))  # type: ignore[arg-type]
+
+
+def test_how_inputs_were_carried_through_is_told_where_they_were_given(tmp_path: Path) -> None:
+    loads, models = {"Load1": measured(tmp_path, "Load1", "bone")}, {"mine": simulated(tmp_path, "mine")}
+    exact, both, by_input = (SimpleNamespace(model=name, u_num=num, u_input=given) for name, num, given in (
+        ("exact", np.nan, np.nan), ("both", 0.1, 0.2), ("theirs", np.nan, 0.2)))  # fmt: skip
+    assert "V&V 20" not in told(loads, models, errors=(exact,))
+    words = told(loads, models, errors=(exact, both, by_input))
+    assert "inputs of both and theirs and of the mesh of both (grid convergence index, Roache 1994) was" in words
+    assert "J Fluids Eng 116(3):405-413" in words
 
 
 def test_directions_are_told_where_loads_do_not_share_them(tmp_path: Path) -> None:
