@@ -28,7 +28,7 @@ from dvc.threads import usable_cores
 ENGINE = GaussNewton(bending=10.0, volume=0.0, rigidity=0.0)
 _OFF_MM = 1.0  # standard deviation of a border that is carried over
 _LEAST_COVERED = 0.8  # of the body by the labels that were carried over
-_LEAST_SHARE = 0.1  # of a tissue in the image: what is found there may be wrong
+_LEAST_SHARE = 0.2  # of a tissue in the image: what is found there may be wrong
 _LEAST_CHANCE = 1e-6
 
 
@@ -182,7 +182,7 @@ def _groups(found: TissueLabels, other: Image, labels: LabelMap, bone: str) -> M
 def _weighed(found: TissueLabels, carried: CarriedLabels, groups: Mapping[str, list[int]]) -> TissueLabels:
     """Tissues found in the image, with the labels that were carried over as what is known beforehand (Bayes).
 
-    The probability of a label is that of its tissue in the image, at least a tenth, times that of the label where it
+    The probability of a label is that of its tissue in the image, at least a fifth, times that of the label where it
     was carried to; the bone is known.
     """
     grid, numbers = found.labels.grid, [*carried.labels.names]

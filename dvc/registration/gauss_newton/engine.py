@@ -215,10 +215,15 @@ def _run(
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         done = Path(folder) / "share done"
         done.write_text("0")
+
+        def follow() -> None:
+            if share := done.read_text():  # else it is being written
+                tell("registering", float(share))
+
         found = worker.run(
             "registering with gauss-newton", fitting, pair.cut(), *given, start,
             lambda share: done.write_text(f"{share:.3f}"),
-            watch=lambda: tell("registering", float(done.read_text() or 0)),
+            watch=follow,
         )  # fmt: skip
     tell("registering", 1.0)
     return found

@@ -86,7 +86,7 @@ def test_image_and_carried_labels_are_weighed() -> None:
     # the bone is known; fat and muscle as the image shows them; where it is overruled, the prior is nearly certain
     assert made.labels.labels.ravel().tolist() == [3, 1, 7, 1, 0]
     assert made.probability[:, 1, 0, 0].tolist() == pytest.approx(
-        [0.0, 0.36 / 0.42, 0.04 / 0.42, 0.02 / 0.42], abs=1e-4
+        [0.0, 0.36 / 0.48, 0.08 / 0.48, 0.04 / 0.48], abs=1e-4
     )
     assert made.probability.sum(axis=0).ravel().tolist() == pytest.approx([1, 1, 1, 1, 0])
     assert made.notes == ("a note",)
@@ -114,7 +114,7 @@ def test_labels_of_another_heel_find_their_places(heels: tuple[Image, LabelMap, 
     assert told[-1] == 1.0
     assert made.labels.names == truth.names  # numbers too
     shares = {name: dice(made.labels.labels == number, truth.labels == number) for number, name in truth.names.items()}
-    for name, least in {"bone": 0.95, "fat": 0.9, "muscle": 0.92, "skin": 0.7, "tendon": 0.4, "ankle": 0.88}.items():
+    for name, least in {"bone": 0.95, "fat": 0.92, "muscle": 0.9, "skin": 0.75, "tendon": 0.5, "ankle": 0.8}.items():
         assert shares[name] > least, shares
     body = made.labels.labels > 0
     assert np.allclose(made.probability.sum(axis=0)[body], 1.0, atol=1e-3)
