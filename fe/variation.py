@@ -124,14 +124,17 @@ def _normals(mesh: TetMesh, cells: IntArray, keys: IntArray) -> tuple[IntArray, 
 
 
 def _moved(mesh: TetMesh, nodes: IntArray, normals: FloatArray, distance_mm: float) -> tuple[TetMesh, float]:
-    """A mesh with nodes moved along normals and the inside smoothly between; all other surface nodes stay."""
+    """A mesh with nodes moved along normals, and those inside tissues smoothly between; all other boundaries stay."""
     count, pairs = len(mesh.points_mm), np.concatenate([mesh.cells[:, [i, j]] for i in range(4) for j in range(i)])
     one = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
     joined = ((one + one.T) > 0).astype(np.float64)
     laplace = (sparse.diags(np.asarray(joined.sum(axis=1)).ravel()) - joined).tocsc()
     step = np.zeros((count, 3))
     step[nodes] = distance_mm * normals
-    still = np.unique(np.concatenate([rows.ravel() for rows in mesh.facets.values()]))
+    regions = np.zeros(count, dtype=np.int64)  # that a node belongs to
+    for cells in mesh.regions.values():
+        regions[np.unique(mesh.cells[cells])] += 1
+    still = np.concatenate([np.flatnonzero(regions > 1), *(rows.ravel() for rows in mesh.facets.values())])
     free = np.setdiff1d(np.arange(count), np.union1d(nodes, still))
     if len(free):
         inner = laplace[free]
@@ -143,6 +146,6 @@ def _moved(mesh: TetMesh, nodes: IntArray, normals: FloatArray, distance_mm: flo
             return TetMesh(points, mesh.cells, mesh.regions, mesh.facets), share
         share *= 0.5
     raise MrstrainError(
-        f"The mesh is too flat near an interface to move it by {abs(distance_mm):.2g} mm. Use a finer mesh, or set "
+        f"The mesh is too flat near an interface to move it by {abs(distance_mm):.3g} mm. Use a finer mesh, or set "
         "labels_voxels = 0 in [uncertainty]."
     )
