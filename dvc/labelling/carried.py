@@ -81,7 +81,7 @@ def labels_from(
     RegistrationError
         If the two bodies do not correspond.
     """
-    if not any(map(is_bones_name, bones_of(labels))):
+    if not set(bones_of(labels)) & set(labels.names.values()):
         raise InputError(
             "No label of the other subject is named like a bone, such as calcaneus, so no bone can be carried over. "
             "Check the names (names)."
