@@ -85,7 +85,7 @@ def test_terms_of_measurement_quality_are_those_of_the_vim_and_say_where_they_ar
         assert len(row["in mrstrain"]) > 20, term
 
 
-@pytest.mark.parametrize("place", ["mrstrain/studies/answer.py", "dvc/measurement/page.py", "validate/report.py"])
+@pytest.mark.parametrize("place", ["mrstrain/measurement/answer.py", "dvc/measurement/page.py", "validate/report.py"])
 def test_reports_say_what_their_intervals_are(place: str) -> None:
     assert "95 % coverage" in (ROOT / place).read_text()
 

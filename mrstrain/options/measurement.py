@@ -45,7 +45,7 @@ class Marks(Options):
     panel: ClassVar[str] = "Inputs"
 
     marks: Path | None = None
-    """Label map of a few strokes in each tissue, from the page of --draw, ITK-SNAP, 3D Slicer (.seg.nrrd) or any other
+    """Label map of a few strokes in each tissue, from the strokes page, ITK-SNAP, 3D Slicer (.seg.nrrd) or any other
     program."""
     mark_names: Path | None = None
     """Table of the names of the marks: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon, 6

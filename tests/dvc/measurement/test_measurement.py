@@ -247,7 +247,7 @@ def titles_of(figure: Figure) -> list[str]:
         ("jacobian", "det F"),
         ("displacement_mm", "mm"),
         ("xy", "component xy"),
-        ("sigma", "standard deviation"),
+        ("sigma", "standard uncertainty"),
     ],
 )
 def test_any_quantity_is_drawn_on_the_planes_asked_for(measured, quantity, label):
