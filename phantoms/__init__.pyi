@@ -1,5 +1,5 @@
 from . import figures
-from .accuracy_run import RIGID, AccuracyCase, ErrorSamples, distances_mm, measure_run
+from .accuracy_run import RIGID, AccuracyCase, ErrorSamples, distances_mm, measure_run, sampled_errors
 from .anatomy import FAT_SIGNAL, TISSUES, Heel
 from .bodies import EllipsoidUnion
 from .error_model import CoverageRow, coverage_rows, fit_error_model
@@ -48,12 +48,12 @@ from .warp import Acquisition, SyntheticWarp, material_points, synthetic_warp
 __all__ = [
     "FAT_SIGNAL", "LOADS", "RIGID", "SOFT", "TISSUES", "AccuracyCase", "Acquisition", "Bending", "Border",
     "CoverageRow", "Efficiency", "EllipsoidUnion", "ErrorRow", "ErrorSamples", "FloorRow", "Flow",
-    "GeometryError", "Heel", "HeelPair", "InputError", "MrstrainError", "ResolutionRow", "RunRow", "ShearStar",
-    "ShearWave", "StarPair", "StarRow", "SyntheticWarp", "TissueError", "acquire", "centred_grid", "compressed",
-    "coverage_rows", "covering", "default_foot_motion", "distances_mm", "efficiencies", "error_rows",
-    "errors_by_tissue", "errors_of_maps", "figures", "fit_error_model", "floor_rows", "heel_grid", "heel_pair",
-    "labels_of", "labels_to_mesh", "material_points", "measure_run", "misdrawn", "motion_named", "pressed",
-    "random_foot_motion", "resolution_rows", "resolved_mm", "run_rows", "scan", "sensitivity", "sheared",
-    "sliding", "star_pair", "star_rows", "stretched", "swelling", "synthetic_warp", "tissue_block",
-    "under_load", "under_plate", "wavelength_recovered",
+    "GeometryError", "Heel", "HeelPair", "InputError", "MrstrainError", "ResolutionRow", "RunRow",
+    "ShearStar", "ShearWave", "StarPair", "StarRow", "SyntheticWarp", "TissueError", "acquire",
+    "centred_grid", "compressed", "coverage_rows", "covering", "default_foot_motion", "distances_mm",
+    "efficiencies", "error_rows", "errors_by_tissue", "errors_of_maps", "figures", "fit_error_model",
+    "floor_rows", "heel_grid", "heel_pair", "labels_of", "labels_to_mesh", "material_points", "measure_run",
+    "misdrawn", "motion_named", "pressed", "random_foot_motion", "resolution_rows", "resolved_mm", "run_rows",
+    "sampled_errors", "scan", "sensitivity", "sheared", "sliding", "star_pair", "star_rows", "stretched",
+    "swelling", "synthetic_warp", "tissue_block", "under_load", "under_plate", "wavelength_recovered",
 ]  # fmt: skip

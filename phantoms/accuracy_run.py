@@ -1,6 +1,7 @@
 """One run of an accuracy study: a phantom pair is made, registered, and compared with the truth voxel by voxel."""
 
 import json
+import re
 import zlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -10,7 +11,18 @@ from typing import Self
 
 import numpy as np
 
-from dvc import Image, LabelMap, Mask, Registration, RigidMotion, Settings, StrainField, evaluate_on_grid, register
+from dvc import (
+    Deformation,
+    Image,
+    LabelMap,
+    Mask,
+    Registration,
+    RigidMotion,
+    Settings,
+    StrainField,
+    evaluate_on_grid,
+    register,
+)
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.atomic_files import whole_file
 from dvc.deformation.protocol import Motion
@@ -78,6 +90,11 @@ class AccuracyCase:
     def keeps_volume(self) -> bool:
         """Whether the motion is isochoric: error models are fitted to such pairs only, registered as such."""
         return self.motion != "swelling"
+
+    @property
+    def kind(self) -> str:
+        """Kind of the motion: its name without the load, as NAME of "NAME-Load1", and "loads" of "Load1" itself."""
+        return re.sub(r"-?Load\d+$", "", self.motion) or "loads"
 
     @property
     def wavelength_mm(self) -> float | None:
@@ -199,7 +216,7 @@ def measure_run(
         progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),
     )  # fmt: skip
     with computing:
-        return _sampled_errors(case, labels, body, motion, registration)
+        return sampled_errors(case, labels, body, motion, registration)
 
 
 def _phantom_pair(case: AccuracyCase) -> tuple[Image, Image, LabelMap, Motion | None]:
@@ -216,10 +233,14 @@ def _phantom_pair(case: AccuracyCase) -> tuple[Image, Image, LabelMap, Motion | 
     return reference, loaded, misdrawn(exact, case.labels_off), motion
 
 
-def _sampled_errors(
-    case: AccuracyCase, labels: LabelMap, body: BoolArray, motion: Motion | None, registration: Registration
+def sampled_errors(
+    case: AccuracyCase, labels: LabelMap, body: BoolArray, truth: Deformation | None, registration: Registration
 ) -> ErrorSamples:
-    """Measured against true displacement and strain, in one of eight labelled voxels of the body."""
+    """Measured against true displacement and strain, in one of eight labelled voxels of the body (ni, nj, nk).
+
+    ``truth`` is u and grad u of tissue relative to its bone, reference configuration, LPS mm; None where there is no
+    strain. Voxels where it is not defined are left out.
+    """
     sampled = np.zeros(labels.grid.shape, dtype=bool)
     sampled[::_STRIDE, ::_STRIDE, ::_STRIDE] = True
     sampled &= body & (labels.labels > 0)
@@ -227,10 +248,11 @@ def _sampled_errors(
     X = labels.grid.points(sampled)
     edge_mm = float(registration.displacement.spacing_mm.min())
     known = np.isfinite(u).all(axis=1) & shows(registration.loaded, registration.alignment.motion.apply(X + u), edge_mm)
-    true_u, true_H = (np.zeros_like(u), np.zeros_like(H)) if motion is None else motion.evaluate(X)
-    strain, truth = StrainField.from_gradient(H), StrainField.from_gradient(true_H)
-    d, n = (motion.direction, motion.normal) if isinstance(motion, ShearWave) else (np.zeros(3), np.zeros(3))
-    error = (strain.max_shear - truth.max_shear).astype(np.float32)
+    true_u, true_H = (np.zeros_like(u), np.zeros_like(H)) if truth is None else truth.evaluate(X)
+    known &= np.isfinite(true_H).all(axis=(1, 2))
+    strain, true = StrainField.from_gradient(H), StrainField.from_gradient(true_H)
+    d, n = (truth.direction, truth.normal) if isinstance(truth, ShearWave) else (np.zeros(3), np.zeros(3))
+    error = (strain.max_shear - true.max_shear).astype(np.float32)
     correlation, lag_mm = _autocorrelation(error, known, sampled, labels)
     to_bone, to_border = distances_mm(labels)
     components = strain.green_lagrange[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
@@ -243,7 +265,7 @@ def _sampled_errors(
         seconds=registration.seconds, unknown=int(np.count_nonzero(~known)),
         folded=int(np.count_nonzero(strain.jacobian[known] <= 0)), tissue=labels.labels[sampled][known],
         to_bone_mm=to_bone[sampled][known], to_border_mm=to_border[sampled][known],
-        true_shear=single(truth.max_shear), shear=single(strain.max_shear), u_error_mm=single(u - true_u),
+        true_shear=single(true.max_shear), shear=single(strain.max_shear), u_error_mm=single(u - true_u),
         mean_abs_strain=single(np.abs(components).mean(axis=1)),
         true_slope=single(np.einsum("i,nij,j->n", d, true_H, n)), slope=single(np.einsum("i,nij,j->n", d, H, n)),
         correlation=correlation, lag_mm=lag_mm,
