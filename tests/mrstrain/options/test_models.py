@@ -173,6 +173,7 @@ def test_help_tells_every_option_with_its_default_and_the_signature_is_plain(
     told, _, raised = told.partition("\n\nRaises\n------\n")
     assert bool(raised) == ("Raises" in verb.with_options.__doc__)
     entries = dict(re.findall(r"^(\w+ : .*)\n((?: {4}.*\n?)+)", told, re.MULTILINE))
+    flags = {model.option(field): field for model in models for field in model.model_fields}
     for model in models:
         for field, info in model.model_fields.items():
             (head,) = [head for head in entries if head.startswith(f"{field} : ")]
@@ -180,7 +181,7 @@ def test_help_tells_every_option_with_its_default_and_the_signature_is_plain(
                 "" if info.is_required() else ", optional" if info.default is None else f", default {info.default!r}"
             )
             assert head.endswith(usual)
-            meaning = re.sub(r"--([a-z-]+)", lambda flag: f"`{flag[1].replace('-', '_')}`", info.description or "")
+            meaning = re.sub(r"--[a-z-]+", lambda flag: f"`{flags[flag[0]]}`", info.description or "")
             assert " ".join(entries[head].split()) == " ".join(meaning.split())
     for name, parameter in inspect.signature(verb.with_options).parameters.items():  # models are called by their fields
         if parameter.annotation in models and name not in inspect.signature(verb).parameters:
