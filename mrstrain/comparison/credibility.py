@@ -10,7 +10,7 @@ References
    17 November 2023.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -183,7 +183,17 @@ def _inputs_sure(held: Holdings) -> str:
         return f"Uncertainty of the comparison: {NOT_GIVEN}"
     known = any(not np.isnan(area.low_ml) for area in held.comparison.areas)
     measured = "is in the intervals" if known else NOT_GIVEN
-    return f"Uncertainty of the measurement: {measured}. Uncertainty of the inputs of the models: {NOT_GIVEN}"
+    errors = held.comparison.errors
+    by_mesh = dict.fromkeys(e.model for e in errors if not np.isnan(e.u_num))
+    by_input = dict.fromkeys(e.model for e in errors if not np.isnan(e.u_input))
+    return (
+        f"Uncertainty of the measurement: {measured}. Uncertainty of the meshes (u_num): {_in_intervals(by_mesh)}. "
+        f"Uncertainty of the inputs of the models (u_input): {_in_intervals(by_input)}"
+    )
+
+
+def _in_intervals(models: Collection[str]) -> str:
+    return f"in the intervals of {', '.join(models)}" if models else NOT_GIVEN
 
 
 def _calibration(held: Holdings) -> Table:

@@ -61,7 +61,8 @@ def comparison(*models: str, low: float = 0.5, reasons: tuple[str, ...] = ()) ->
     )
     ranking = SimpleNamespace(areas=areas[::3], statements=("Best match over all loads (area metric): trebbi.",))
     verdict = Verdict("caution", reasons) if reasons else Verdict("trust")
-    return SimpleNamespace(areas=areas, ranking=ranking, strains=(0.2, 0.5), verdict=verdict)
+    errors = tuple(SimpleNamespace(model=m, u_num=np.nan, u_input=np.nan) for m in models)
+    return SimpleNamespace(areas=areas, ranking=ranking, strains=(0.2, 0.5), verdict=verdict, errors=errors)
 
 
 def held(folders: dict[str, Path], **more: Any) -> Holdings:
@@ -74,6 +75,18 @@ def table(section: Section, title: str) -> Table:
 
 def rows(section: Section, title: str) -> dict[str, tuple[str, ...]]:
     return {str(row[0]): tuple(map(str, row[1:])) for row in table(section, title).rows}
+
+
+def test_uncertainty_of_mesh_and_inputs_is_that_of_the_comparison(tmp_path: Path) -> None:
+    made = comparison("trebbi", "ansys")
+    folders = {"trebbi": simulation(tmp_path, "trebbi")}
+    (none,) = rows(credibility_section(held(folders, comparison=made)), "Evidence by category")[f"8. {CATEGORIES[-1]}"]
+    assert f"(u_num): {NOT_GIVEN}" in none
+    assert f"(u_input): {NOT_GIVEN}" in none
+    made.errors[0].u_num, made.errors[1].u_input = 0.1, 0.2
+    (known,) = rows(credibility_section(held(folders, comparison=made)), "Evidence by category")[f"8. {CATEGORIES[-1]}"]
+    assert "(u_num): in the intervals of trebbi." in known
+    assert "(u_input): in the intervals of ansys." in known
 
 
 def test_all_categories_and_factors_stand_there_once_and_nothing_is_graded(tmp_path: Path) -> None:
