@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import isotonic_regression
 
-from dvc import Deformation, Grid, Image, LabelMap
+from dvc import Deformation, Grid, Image, LabelMap, StrainField
 from dvc.arrays import FloatArray
 from phantoms.anatomy import Heel
 from phantoms.bodies import EllipsoidUnion
@@ -87,8 +87,9 @@ class StarRow:
 def star_rows(measured: Deformation, pair: StarPair) -> list[StarRow]:
     """What is recovered of the star, by tissue and rising period.
 
-    Of the displacement, on the middle plane, where it is the amplitude everywhere; of the shear strain, a quarter of a
-    period to either side, where it is largest. Both are means over the direction in which the star does not vary.
+    Of the displacement, on the middle plane, where it is the amplitude everywhere; of the shear strain E_dn
+    (Green-Lagrange), a quarter of a period to either side, where it is largest. Both are means over the direction in
+    which the star does not vary.
     """
     star, rows = pair.star, list[StarRow]()
     grid = pair.labels.grid
@@ -99,16 +100,21 @@ def star_rows(measured: Deformation, pair: StarPair) -> list[StarRow]:
         middle = star.centre_mm + s[:, None] * star.along + z[:, None] * star.direction
         period = star.period_mm(middle)
         u = measured.displacement(middle) @ star.direction / star.amplitude_mm
-        peak, strain = 2.0 * np.pi * star.amplitude_mm / period, np.zeros(len(period))
+        both, strain = 2.0 * np.pi * star.amplitude_mm / period, np.zeros(len(period))  # true E_dn, of both sides
         for side in (1.0, -1.0):
             H = measured.evaluate(middle + side * 0.25 * period[:, None] * star.normal)[1]
-            strain -= 0.5 * side * np.einsum("i,nij,j->n", star.direction, H, star.normal) / peak
+            strain -= side * _shear(H, star) / both
         edges = np.linspace(period.min(), period.max(), _BINS + 1)
         bins = np.clip(np.digitize(period, edges) - 1, 0, _BINS - 1)
         for n in range(_BINS):
             here = bins == n
             rows.append(StarRow(tissue, *(float(np.nanmean(of[here])) for of in (period, u, strain))))
     return rows
+
+
+def _shear(H: FloatArray, star: ShearStar) -> FloatArray:
+    """The component E_dn (n,) of the Green-Lagrange strain of gradients H (n, 3, 3), which the star has."""
+    return np.asarray(np.einsum("i,nij,j->n", star.direction, StrainField.from_gradient(H).green_lagrange, star.normal))
 
 
 def _depths(pair: StarPair) -> dict[str, FloatArray]:
@@ -172,9 +178,7 @@ def efficiencies(measured: Deformation, still: Deformation, pair: StarPair) -> l
         axes = np.stack([star.along, star.normal, star.direction])
         u, H = still.evaluate(star.centre_mm + points @ axes)
         along = u @ star.direction
-        E = 0.5 * (H + H.transpose(0, 2, 1) + H.transpose(0, 2, 1) @ H)
-        shear = np.einsum("i,nij,j->n", star.direction, E, star.normal)
-        noise = (float(f(of)) for of in (along, shear) for f in (np.nanmean, np.nanstd))
+        noise = (float(f(of)) for of in (along, _shear(H, star)) for f in (np.nanmean, np.nanstd))
         made.append(Efficiency(tissue, *found, *noise))
     return made
 

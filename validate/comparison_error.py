@@ -64,8 +64,8 @@ class ComparisonError:
 
     @property
     def significant(self) -> bool:
-        """Whether the interval of the error excludes zero."""
-        return not self.low <= 0.0 <= self.high
+        """Whether the interval of the error excludes zero; not where the error is unknown."""
+        return self.low > 0.0 or self.high < 0.0
 
 
 def comparison_errors(
@@ -117,7 +117,8 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     shown = [one for one in errors if one.tissue == tissue]
     if not shown:
         return []
-    strains = [one for one in shown if one.figure != AREA]
+    figures = [one for one in shown if one.figure != AREA]
+    strains = [one for one in figures if not np.isnan(one.error)]
     beyond = sum(one.significant for one in strains)
     lacking = {
         "u_num": [one.model for one in strains if np.isnan(one.u_num)],
@@ -128,6 +129,8 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
         "all models in all soft tissue; there, the model itself is wrong, and not only its inputs or the measurement."
     ]
     words += [f"{u} not given: {', '.join(dict.fromkeys(names))}." for u, names in lacking.items() if names]
+    if unknown := dict.fromkeys(one.figure for one in figures if np.isnan(one.error)):
+        words.append(f"There is no D, and no E, beyond the range of the measured curves: {', '.join(unknown)}.")
     columns = ("model", "figure", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E from", "to")
     table = Table(
         "Comparison error and validation uncertainty (ASME V&V 20)", columns,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dvc.arrays import FloatArray
 from phantoms import ShearStar, StarPair, efficiencies, resolved_mm, star_pair, star_rows, tissue_block
@@ -116,3 +117,26 @@ def test_the_resolution_is_that_from_which_on_all_is_recovered() -> None:
     assert np.isnan(resolved_mm([5.0, 10.0], [np.nan, 1.0]))
     assert np.isnan(resolved_mm([5.0, 10.0], [0.95, 0.99]))
     assert np.isnan(resolved_mm([5.0, 10.0], [0.5, 0.8]))
+
+
+@dataclass(frozen=True)
+class Turned:
+    """A star, and then a rotation about x, which is no strain."""
+
+    star: ShearStar
+    degrees: float
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        turn = Rotation.from_euler("x", self.degrees, degrees=True).as_matrix()
+        points = np.asarray(points_mm)
+        u, H = self.star.evaluate(points)
+        return (points + u) @ turn.T - points, turn @ (H + np.eye(3)) - np.eye(3)
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        return self.evaluate(points_mm)[0]
+
+
+def test_a_rotation_is_no_part_of_the_strain_that_is_recovered(pair: StarPair) -> None:
+    """The resolved strain is the component of which the noise is told, and not a slope, which a rotation changes."""
+    for row in star_rows(Turned(pair.star, 5.0), pair):
+        assert row.strain == pytest.approx(1.0, abs=1e-9)

@@ -13,6 +13,7 @@ from dvc.mesh import TetMesh
 from tests.blocks import block
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, sheared
 from validate import ALL, Criteria, FeResult, Variant, area_between, bands, compare_load, rank_over_loads
+from validate.comparison_error import validation_section
 from validate.sensitivity import Sensitivity, changes_of
 
 STRAINS = (0.2, 0.8)
@@ -187,3 +188,19 @@ def test_a_variant_without_its_change_is_refused(steps: float) -> None:
     mesh = block((2, 2, 2), (20.0, 20.0, 20.0))
     with pytest.raises(InputError, match="'force' needs the change of the input in standard uncertainties"):
         Variant("force", steps, lambda: moved(mesh, 0.1))
+
+
+def test_a_figure_that_the_measurement_does_not_show_is_not_counted_as_a_wrong_model() -> None:
+    """The measured median lies beyond the range of the drawn curves: there is no error, so none that is significant."""
+    results = [model("m", cube(), 1.25, force=0.04)]
+    one = compare_load(
+        case("Load1", sheared(1.2), results, error_table(0.0, 0.01)), labels(), criteria=Criteria((0.05, 0.2))
+    )
+    rows = {e.figure: e for e in one.errors if e.tissue == ALL}
+    unknown = [e for name, e in rows.items() if name in ("median", "p95")]
+    assert np.isnan([e.error for e in unknown]).all()
+    assert not any(e.significant for e in unknown)
+    (section,) = validation_section("Load1", one.errors, ALL)
+    above = sum(name.startswith("volume above") for name in rows)
+    assert f" of {above} figures" in section.paragraphs[0]  # those with an error
+    assert "There is no D, and no E, beyond the range of the measured curves: median, p95." in section.paragraphs
