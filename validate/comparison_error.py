@@ -124,9 +124,12 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
         "u_num": [one.model for one in strains if np.isnan(one.u_num)],
         "u_input": [one.model for one in strains if np.isnan(one.u_input)],
     }
+    cause = "the model itself is wrong: mesh, inputs and measurement do not explain the difference"
+    if any(lacking.values()):
+        cause = "the measurement does not explain the difference. Inputs or meshes that are not given below might"
     words = [
         f"The comparison error exceeds the expanded validation uncertainty in {beyond} of {len(strains)} figures of "
-        "all models in all soft tissue; there, the model itself is wrong, and not only its inputs or the measurement."
+        f"all models in all soft tissue. There, {cause}."
     ]
     words += [f"{u} not given: {', '.join(dict.fromkeys(names))}." for u, names in lacking.items() if names]
     if unknown := dict.fromkeys(one.figure for one in figures if np.isnan(one.error)):

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dvc import Subject
+from dvc.measurement.subject import is_bones_name
 from dvc.report.page import Section, Table
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
@@ -28,10 +29,13 @@ def measured_strain(
 
 
 def table_of_loads(measured: Sequence[Section]) -> Table | None:
-    """The measured maximum shear strain of each load and tissue, from the sections of the loads; None without any."""
+    """The measured maximum shear strain of each load and soft tissue, from the sections of the loads; None without any.
+
+    Bones have their rows in the sections: they are rigid, and their strain is an error.
+    """
     tables = [(section.title, section.summary) for section in measured if section.summary is not None]
     if not tables:
         return None
-    rows = tuple((load, *row) for load, of in tables for row in of.rows)
+    rows = tuple((load, *row) for load, of in tables for row in of.rows if not is_bones_name(str(row[0])))
     note = _NOTE.format(_INTERVALS if any(of.note for _, of in tables) else "")
     return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, note)

@@ -13,7 +13,7 @@ from dvc.mesh import TetMesh
 from tests.blocks import block
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, sheared
 from validate import ALL, Criteria, FeResult, Variant, area_between, bands, compare_load, rank_over_loads
-from validate.comparison_error import validation_section
+from validate.comparison_error import ComparisonError, validation_section
 from validate.sensitivity import Sensitivity, changes_of
 
 STRAINS = (0.2, 0.8)
@@ -204,3 +204,17 @@ def test_a_figure_that_the_measurement_does_not_show_is_not_counted_as_a_wrong_m
     above = sum(name.startswith("volume above") for name in rows)
     assert f" of {above} figures" in section.paragraphs[0]  # those with an error
     assert "There is no D, and no E, beyond the range of the measured curves: median, p95." in section.paragraphs
+
+
+def test_a_model_is_called_wrong_only_where_its_mesh_and_inputs_are_known() -> None:
+    def error(u_num: float, u_input: float) -> ComparisonError:
+        return ComparisonError("m", "Load1", ALL, "median", 0.3, 0.2, 0.1, u_num, u_input, 0.01, 0.01, 0.08, 0.12)
+
+    def said(one: ComparisonError) -> str:
+        (section,) = validation_section("Load1", [one], ALL)
+        return section.paragraphs[0]
+
+    assert "the model itself is wrong" in said(error(0.001, 0.002))
+    for lacking in (error(np.nan, 0.002), error(0.001, np.nan)):
+        assert "wrong" not in said(lacking)
+        assert "not given below might" in said(lacking)
