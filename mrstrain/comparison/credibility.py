@@ -1,6 +1,6 @@
-"""What a comparison holds for an assessment of credibility after ASME V&V 40 and FDA, as a section of a report.
+"""Evidence of a comparison for a credibility assessment after ASME V&V 40 and FDA, as a section of a report.
 
-The program tells what it knows and grades nothing: question, context of use, risk and levels are a person's.
+The program fills in what it knows and grades nothing: a person states question, context of use, risk and levels.
 
 References
 ----------
@@ -28,9 +28,9 @@ from validate import ALL, NOTHING, Comparison
 TITLE = "Credibility (ASME V&V 40, FDA)"
 """Title of the section of a report."""
 _ABOUT = (
-    "What this report holds for an assessment of credibility after ASME V&V 40-2018 and FDA's guidance of 17 November "
-    "2023. The program fills in what it knows, and grades nothing: a person judges levels and risk. What only a person "
-    "can tell is in the study file, under [credibility], and is not given until it is there."
+    "Evidence in this report for a credibility assessment after ASME V&V 40-2018 and FDA's guidance of 17 November "
+    "2023. The program fills in what it knows and grades nothing: a person judges levels and risk. All else comes from "
+    "the study file, under [credibility]; what is missing there is not given."
 )
 CODE = (
     "Order of convergence to a closed form of nearly incompressible tissue, of the displacement and its gradient: P1 "
@@ -111,7 +111,7 @@ def _evidence(held: Holdings) -> Table:
     """FDA's eight categories of evidence."""
     given, others = held.given, held.of_kind("other")
     own = f"mrstrain {versions()['mrstrain']}. {CODE}"
-    foreign = f"Nothing is known here of the code of {_names(others)}" if others else ""
+    foreign = f"Code verification of {_names(others)}: {NOT_GIVEN}" if others else ""
     calibrated = used_for_calibration(held.models)
     found = f"{len(calibrated)} found, listed below" if calibrated else "none found in the records"
     by_person = _by_person(given.calibration)
@@ -126,8 +126,8 @@ def _evidence(held: Holdings) -> Table:
         ("8. Calculation verification and UQ results", _sentences(_calculated(held), _inputs_sure(held))),
     )  # fmt: skip
     note = (
-        "Categories of FDA's guidance. A comparison counts as in vivo only if the subject is alive: a phantom's is a "
-        "test of the program, a specimen's a bench test."
+        "Categories of FDA's guidance. A comparison counts as in vivo only with a living subject: with a phantom it is "
+        "a test of the program, with a specimen a bench test."
     )
     return Table("Evidence by category", ("category", "what this report holds"), rows, note)
 
@@ -142,7 +142,7 @@ def _validation(held: Holdings) -> str:
 
 
 def _areas(held: Holdings, comparison: Comparison) -> str:
-    """The area of each model over all loads; of those that take the measured displacement, it is said."""
+    """The area of each model over all loads; models with measured boundary conditions are marked as such."""
     driven = {one.name: " with measured boundary conditions" for one in held.of_kind("driven")}
     areas = [a for a in comparison.ranking.areas if not a.levelled] or [
         a for a in comparison.areas if a.tissue == ALL and a.model != NOTHING and not a.levelled
@@ -192,7 +192,7 @@ def _calibration(held: Holdings) -> Table:
     nothing = ("Nothing was found in the records", "", "")
     note = (
         "Found in the records of the models. Bones are rigid in the models, and in the measurement their motion is "
-        "removed: agreement at the bone is no evidence. Models that were meshed from the label map of the measurement "
+        "removed: agreement at the bone is not evidence. Models that were meshed from the label map of the measurement "
         "share its errors."
     )
     columns = ("data", "used for", "so it cannot validate")

@@ -1,4 +1,4 @@
-"""How images were acquired and measured: what headers, records and a study file tell, as a table and as a sentence."""
+"""How images were acquired and measured, from headers, records and a study file: as a table and as a sentence."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # it draws
 TITLE = "Acquisition and measurement"
 """Title of the section of a report."""
 NOT_GIVEN = "not given"
-"""In place of what neither a file nor a person tells."""
+"""Shown for a value that no file gives."""
 ACQUIRED = "Images were acquired"
 """How the sentence of the methods text begins."""
 _SCANS, _NOISE = "scans", "noise"  # in provenance.json
@@ -31,10 +31,11 @@ _PARAMETERS = {
     "flip_angle_deg": "Flip angle, degrees", "acquisition_matrix": "Matrix of the acquisition",
 }  # fmt: skip
 _NOTE = (
-    "Header: DICOM, or the JSON file of dcm2niix beside a NIfTI file. Of its texts, only known names of scanners and "
-    "sequences are shown, so that no patient is named. A study file can give the rest, under [acquisition]. SNR: 75th "
-    "percentile of the tissue over the standard deviation of the noise. Standard uncertainty: standard deviation of "
-    "the error. The spatial resolution was measured on phantoms only (benchmark record, Spatial resolution)."
+    "Header: DICOM, or the JSON file of dcm2niix beside a NIfTI file. Its texts are shown only if they are known "
+    "names of scanners and sequences, so that no patient is named. A study file can give the rest, under "
+    "[acquisition]. SNR: 75th percentile of the tissue over the standard deviation of the noise. Standard uncertainty: "
+    "standard deviation of the error. The spatial resolution was measured on phantoms only (benchmark record, Spatial "
+    "resolution)."
 )
 _WEIGHTS = {"bending": "1/mm", "volume": "1/mm³", "rigidity": "1/mm³", "volume_gradient": "1/mm"}
 _SPLINE_ALONE = "none but the control point spacing"

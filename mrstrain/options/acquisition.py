@@ -1,4 +1,4 @@
-"""What a person tells of the acquisition, where no header does."""
+"""Parameters of the acquisition that a person states because no header has them."""
 
 from typing import ClassVar
 

@@ -91,7 +91,7 @@ def run(
     workers : int, optional
         Number of stages at the same time on this machine; by default one for each core.
     quick : bool
-        Leave out the further solutions for the input uncertainty of the models ([uncertainty]); the report says so.
+        Skip the variants for the input uncertainty of the models ([uncertainty]); the report says so.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
     on_report : callable, optional

@@ -108,7 +108,7 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     section = credibility_section(held(folders, comparison=comparison(*folders), subject="Heel 3"))
     evidence = {name[3:]: told for name, (told,) in rows(section, "Evidence by category").items()}
     assert CODE in evidence["Code verification results"]
-    assert "Nothing is known here of the code of ansys." in evidence["Code verification results"]
+    assert "Code verification of ansys: not given." in evidence["Code verification results"]
     vivo = evidence["In vivo validation results"]
     assert vivo.startswith("Verdicts on the measurement: Load1 Trust. Best match over all loads (area metric): trebbi.")
     assert "its interval of 95 % coverage: trebbi 1.00 (0.50 to 1.50), luboz 1.00 (0.50 to 1.50), ansys" in vivo

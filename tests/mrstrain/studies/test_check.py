@@ -149,7 +149,7 @@ def test_labels_without_a_boundary_to_correct_are_told(study):
     asked = ('names = "tissues.csv"', 'names = "tissues.csv"\ncorrect_labels = true')
     assert wrong(study, asked, ('"mine.toml", ', "")) == ""
     told = [note for note in check(study).notes if "correct_labels" in note]
-    assert told == ["WARNING: no label is named skin, so correct_labels leaves its boundary."]
+    assert told == ["WARNING: no label is named skin, so correct_labels corrects only bones."]
     values = np.ones(GRID.shape, dtype=np.int64)
     values[:4] = 2
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "heel"}))
