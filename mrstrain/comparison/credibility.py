@@ -19,6 +19,7 @@ import numpy as np
 from dvc import Verdict
 from dvc.report.page import Section, Table
 from fe import Tolerance
+from mrstrain.comparison.methods import models_with
 from mrstrain.comparison.model_facts import ModelFacts, facts_of, used_for_calibration
 from mrstrain.measurement.acquisition import NOT_GIVEN
 from mrstrain.options.credibility import CredibilityOptions
@@ -123,7 +124,7 @@ def _evidence(held: Holdings) -> Table:
         ("5. Population-based validation results", _sentences("One subject here", _by_person(given.population))),
         ("6. Emergent model behavior", _told(given.emergent_behaviour)),
         ("7. Model plausibility", _sentences(_plausible(held), _by_person(given.plausibility))),
-        ("8. Calculation verification and UQ results", _sentences(_calculated(held), _inputs_sure(held))),
+        ("8. Calculation verification and UQ results", _sentences(_calculated(held), _uncertainties(held))),
     )  # fmt: skip
     note = (
         "Categories of FDA's guidance. A comparison counts as in vivo only with a living subject: with a phantom it is "
@@ -178,12 +179,20 @@ def _solved(held: Holdings) -> str:
     return f"Residual forces at each converged increment: at most {force}; {reached}"
 
 
-def _inputs_sure(held: Holdings) -> str:
+def _uncertainties(held: Holdings) -> str:
+    """Which uncertainties are in the intervals of the comparison."""
     if held.comparison is None:
         return f"Uncertainty of the comparison: {NOT_GIVEN}"
     known = any(not np.isnan(area.low_ml) for area in held.comparison.areas)
-    measured = "is in the intervals" if known else NOT_GIVEN
-    return f"Uncertainty of the measurement: {measured}. Uncertainty of the inputs of the models: {NOT_GIVEN}"
+    by_input, by_mesh = models_with(held.comparison, "u_input"), models_with(held.comparison, "u_num")
+    return _sentences(
+        f"Measurement uncertainty: {'in the intervals' if known else NOT_GIVEN}",
+        f"Input uncertainty: {_in_intervals(by_input)}", f"Error of the mesh: {_in_intervals(by_mesh)}",
+    )  # fmt: skip
+
+
+def _in_intervals(models: Sequence[str]) -> str:
+    return f"in the intervals of {', '.join(models)}" if models else NOT_GIVEN
 
 
 def _calibration(held: Holdings) -> Table:

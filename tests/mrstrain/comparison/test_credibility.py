@@ -52,8 +52,11 @@ def simulation(folder: Path, name: str, *, title: str = "", reached: float = 1.0
     return place.parent
 
 
-def comparison(*models: str, low: float = 0.5, reasons: tuple[str, ...] = ()) -> Any:
-    """A comparison of models under one load, each with an area of 1 mL."""
+def comparison(
+    *models: str, low: float = 0.5, reasons: tuple[str, ...] = (), inputs: dict[str, tuple[float, float]] | None = None
+) -> Any:
+    """A comparison of models under one load, each with an area of 1 mL, and u_num and u_input of some."""
+    errors = tuple(SimpleNamespace(model=m, u_num=num, u_input=by) for m, (num, by) in (inputs or {}).items())
     areas = tuple(
         SimpleNamespace(model=m, tissue=t, load="all loads", levelled=False, best_ml=1.0, low_ml=low, high_ml=1.5)
         for m in models
@@ -61,7 +64,7 @@ def comparison(*models: str, low: float = 0.5, reasons: tuple[str, ...] = ()) ->
     )
     ranking = SimpleNamespace(areas=areas[::3], statements=("Best match over all loads (area metric): trebbi.",))
     verdict = Verdict("caution", reasons) if reasons else Verdict("trust")
-    return SimpleNamespace(areas=areas, ranking=ranking, strains=(0.2, 0.5), verdict=verdict)
+    return SimpleNamespace(areas=areas, ranking=ranking, strains=(0.2, 0.5), verdict=verdict, errors=errors)
 
 
 def held(folders: dict[str, Path], **more: Any) -> Holdings:
@@ -116,7 +119,10 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     assert calculated.startswith("Mesh convergence: not given (mrstrain converge)")
     assert MESH_DOUBT in calculated
     assert "reached in part: luboz Load1 40%" in calculated
-    assert "Uncertainty of the measurement: is in the intervals" in calculated
+    assert (
+        "Measurement uncertainty: in the intervals. Input uncertainty: not given. Error of the mesh: not given"
+        in calculated
+    )
     for name in ("Bench test validation results", "Emergent model behavior"):
         assert evidence[name] == NOT_GIVEN
     assert rows(section, "Applicability") == {
@@ -133,10 +139,21 @@ def test_without_intervals_or_a_comparison_nothing_is_claimed(tmp_path: Path) ->
     folders = {"trebbi": simulation(tmp_path, "trebbi")}
     told = str(credibility_section(held(folders, comparison=comparison("trebbi", low=np.nan))).tables)
     assert "trebbi 1.00 (no interval)" in told
-    assert "Uncertainty of the measurement: not given" in told
+    assert "Measurement uncertainty: not given" in told
     section = credibility_section(held(folders))
     assert rows(section, "Credibility factors")["Output comparison"][0] == NOT_GIVEN
     assert "Comparison with models: not given" in str(section.tables)
+
+
+def test_input_uncertainty_that_is_in_the_intervals_is_told_with_the_models_that_have_it(tmp_path: Path) -> None:
+    folders = {name: simulation(tmp_path, name) for name in ("trebbi", "luboz")}
+    one = comparison("trebbi", "luboz", inputs={"trebbi": (0.01, 0.02), "luboz": (np.nan, 0.01)})
+    told = rows(credibility_section(held(folders, comparison=one)), "Evidence by category")
+    (calculated,) = told["8. Calculation verification and UQ results"]
+    assert (
+        "Input uncertainty: in the intervals of trebbi, luboz. Error of the mesh: in the intervals of trebbi"
+        in calculated
+    )
 
 
 def test_mesh_convergence_takes_the_place_of_the_known_doubt(tmp_path: Path) -> None:
