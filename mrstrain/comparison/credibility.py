@@ -260,7 +260,7 @@ def _factors(held: Holdings) -> Table:
 
 
 def _equivalent(held: Holdings) -> str:
-    """Whether models and measurement had the same inputs, as far as the comparison can tell."""
+    """Whether models and measurement had the same inputs, as far as the comparison shows."""
     if held.comparison is None:
         return NOT_GIVEN
     verdict = held.comparison.verdict

@@ -82,7 +82,7 @@ def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
 
 
 def _acquired(measured: Mapping[str, Path]) -> list[str]:
-    """How the images were acquired, if their headers tell."""
+    """How the images were acquired, if their headers describe it."""
     return [told] if (told := acquisition_sentence(measured)) else []
 
 

@@ -44,7 +44,7 @@ _Row = tuple[str, str, str]
 
 
 def scans_record(unloaded: tuple[Path, Image], loads: Mapping[str, tuple[Path, Image]]) -> dict[str, object]:
-    """What provenance keeps of the acquisition of each image: matrix, voxel size (mm), and what its header tells."""
+    """Acquisition of each image for provenance.json: matrix, voxel size (mm), and the parameters in its header."""
     return {
         _SCANS: {
             name: {
@@ -57,7 +57,7 @@ def scans_record(unloaded: tuple[Path, Image], loads: Mapping[str, tuple[Path, I
 
 
 def noise_record(measured: "Measurement") -> dict[str, object]:
-    """What provenance keeps of the noise of a pair: the SNR of both images, and the median standard uncertainty."""
+    """Noise of a pair for provenance.json: SNR of both images, and median standard uncertainty of the max. shear."""
     found = None if measured.source is None else measured.source.registration
     reference, loaded = (None, None) if found is None else found.noise
     snr = {"unloaded": reference, "loaded": loaded}
@@ -77,7 +77,7 @@ def acquisition_section(folders: Mapping[str, Path], given: AcquisitionOptions |
 
 
 def acquisition_sentence(folders: Mapping[str, Path], given: AcquisitionOptions | None = None) -> str:
-    """A paragraph of a methods section on the acquisition; empty if neither a header nor a person tells of it."""
+    """A paragraph of a methods section on the acquisition; empty if no header and no study file describes it."""
     known = _Known.read(folders, given)
     told = {name: known.in_a_sentence(name) for name in _PARAMETERS}
     if all(value == NOT_GIVEN for value in told.values()):
@@ -102,7 +102,7 @@ def acquisition_sentence(folders: Mapping[str, Path], given: AcquisitionOptions 
 
 
 class _Known:
-    """What the records of measured loads and a person tell, by image."""
+    """Acquisition parameters by image, from the records of measured loads and from the study file."""
 
     def __init__(self, records: Mapping[str, Record], qualities: Mapping[str, Record], given: AcquisitionOptions):
         self.qualities, self.given = qualities, given
@@ -128,7 +128,7 @@ class _Known:
         return _together({name: read(scan) for name, scan in self.scans.items()})
 
     def parameter(self, name: str) -> tuple[str, str]:
-        """A parameter of the acquisition, and where it is from; both sources where they do not agree."""
+        """A parameter of the acquisition and its source; both values if header and study file differ."""
         of_header, by_person = self.images(lambda scan: scan.get(name)), _text(getattr(self.given, name))
         if of_header == NOT_GIVEN:
             return by_person, "" if by_person == NOT_GIVEN else "study file"
@@ -137,14 +137,14 @@ class _Known:
         return of_header, "header"
 
     def in_a_sentence(self, name: str) -> str:
-        """A parameter as the headers that have it tell it, or else as the person does."""
+        """A parameter from the headers that have it, or else from the study file."""
         values = self._told_by_headers(name)
         if len(values) < 2:
             return next(iter(values), _text(getattr(self.given, name)))
         return " and ".join(f"{value} ({', '.join(of)})" for value, of in values.items())
 
     def _told_by_headers(self, name: str) -> dict[str, list[str]]:
-        """The values that headers tell, each with its images."""
+        """Values from headers, each with its images."""
         values: dict[str, list[str]] = {}
         for image, scan in self.scans.items():
             if (value := _text(scan.get(name))) != NOT_GIVEN:
@@ -190,7 +190,7 @@ class _Known:
 
     @staticmethod
     def _measured(words: str, value: str, given: str | float | None = None, source: str = "images") -> _Row:
-        """A row with what was measured here, and what a person measured otherwise."""
+        """A row with the value measured here, and that of the study file if there is one."""
         own = _text(given)
         if value == NOT_GIVEN:
             return words, own, "" if own == NOT_GIVEN else "study file"

@@ -204,7 +204,7 @@ def _tilts(setting: _Setting, spread: Uncertainty) -> dict[str, dict[str, tuple[
 
 
 def _record_mesh(folder: Path, name: str, fine: TetMesh, coarse: TetMesh) -> str:
-    """Record the solution on the coarser mesh as a variant, unless the meshes are too much alike; what was found."""
+    """Record the solution on the coarser mesh as a variant, unless the meshes are too similar; return a sentence."""
     ratio = fe.cell_size_mm(coarse) / fe.cell_size_mm(fine)
     told = f"mesh: cells of {fe.cell_size_mm(fine):.2f} and {fe.cell_size_mm(coarse):.2f} mm, a ratio of {ratio:.2f}"
     if ratio < _LEAST_RATIO:

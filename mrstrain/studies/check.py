@@ -68,7 +68,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     looked.at_loaded(reference)
     if labels is not None and told.models.results:
         looked.tried(looked.at_results, labels)
-    looked.at_what_a_person_tells()
+    looked.at_report_details()
     planned = looked.tried(plan, told)
     if planned is not None and not looked.wrong:
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
@@ -319,7 +319,7 @@ class _Look:
                 "named skin."
             )
 
-    def at_what_a_person_tells(self) -> None:
+    def at_report_details(self) -> None:
         """Note which keys of [acquisition] and [credibility] are not given; none is required."""
         place = self.study.path(self.study.images.load0)
         told = read_scan_parameters(place).known() | self.study.acquisition.model_dump(exclude_none=True)

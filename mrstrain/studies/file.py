@@ -182,7 +182,7 @@ class Study(_Part):
         """A key of a table with its line in the file, for messages."""
         return _named(self._lines, table, key)[1]
 
-    def quickly(self) -> Self:
+    def without_variants(self) -> Self:
         """The same study without the variants for the input uncertainty of the models."""
         return self.model_copy(update={"uncertainty": self.uncertainty.model_copy(update={"quick": True})})
 

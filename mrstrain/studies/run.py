@@ -121,7 +121,7 @@ def run(
 
 def _chosen(study: Path | str | Study, quick: bool) -> Study:
     told = read_study(study)
-    return told.quickly() if quick and told.uncertainty.solves else told
+    return told.without_variants() if quick and told.uncertainty.solves else told
 
 
 def run_studies(

@@ -57,7 +57,7 @@ def planned(folder: Path, table: str, quick: bool = False) -> dict[str, Stage]:
     (folder / "soft.toml").write_text(SET)
     (folder / "study.toml").write_text(PLAIN + table)
     study = read_study(folder)
-    return {stage.name: stage for stage in plan(study.quickly() if quick else study)}
+    return {stage.name: stage for stage in plan(study.without_variants() if quick else study)}
 
 
 def test_further_solutions_are_stages_which_quick_leaves_out(tmp_path: Path) -> None:
