@@ -4,9 +4,9 @@
 
 A small pad of fat and skin under a rounded bone has a hidden law: fat of three stiffnesses, mixed at random. In each
 case, the force, the direction of the plate, the thickness of bone and skin, and Poisson's ratio of each model get
-errors drawn with their stated standard deviations, and the models have a coarser mesh than the truth. Three models, whose fat
-is stiffer or softer at random, are compared with a measurement whose error is drawn from the error model of the
-Gauss-Newton engine. The intervals should hold the area of each model with right inputs, on the mesh of the truth.
+errors drawn with their stated standard deviations, and the models have a coarser mesh than the truth. Three models,
+whose fat is stiffer or softer at random, are compared with a measurement whose error is drawn from the error model of
+the Gauss-Newton engine. The intervals should hold the area of each model with right inputs, on the mesh of the truth.
 
 The result is the coverage of the intervals; the pairs in the wrong order among those called significantly different;
 and the number of pairs called so (power). All is repeated with the inputs taken as exact. Skin is hardly strained here,
