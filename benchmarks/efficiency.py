@@ -3,9 +3,9 @@
     python -m benchmarks.efficiency --out benchmarks/results/efficiency.json
 
 A block of fat and muscle (160 x 56 x 56 voxels of 0.8 mm, SNR 25) moves by 0.6 mm in waves of shear whose period grows
-from 4 to 40 mm. Resolution is the period from which on 90 % of the amplitude is recovered. Noise is that between two
-scans without motion, registered as a repeat scan is, with the default weights: weights chosen for a pair without motion
-would smooth more. Volume is kept. Nothing is aligned, and there is no bone.
+from 4 to 40 mm. Resolution is the shortest period from which at least 90 % of the amplitude is recovered. Noise is that
+between two scans without motion, registered like a repeat scan with the default weights: weights chosen for a pair
+without motion would smooth more. Volume is kept. Nothing is aligned, and there is no bone.
 """
 
 from __future__ import annotations

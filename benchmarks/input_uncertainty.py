@@ -1,15 +1,17 @@
-"""How often intervals hold, and orders are right, where force, direction, labels, materials and mesh are wrong.
+"""How often intervals hold and orders are right if force, direction, labels, materials and mesh are wrong.
 
     python -m benchmarks.input_uncertainty --cases 40 --out benchmarks/results/input_uncertainty.json
 
 A small pad of fat and skin under a rounded bone has a hidden law: fat of three stiffnesses, mixed at random. In each
-case force, direction of the plate, thickness of bone and skin, and Poisson's ratio of each model are wrong by draws of
-their stated spreads, and models have a coarser mesh than the truth. Three models, whose fat is stiffer or softer by
-draws, are compared with a measurement, whose error is drawn from the error model of the Gauss-Newton engine. What is to
-be held is the area of each model with right inputs, on the mesh of the truth. Told: coverage of the intervals; of the
-pairs called significantly different, those in the wrong order; and how many pairs are called so at all (power). All
-this also with the inputs taken as exact. Skin is hardly strained here, so its areas do not count. The measurement is
-right by its own error model, so that only the models are on trial. Cases that the file holds are not made again.
+case, the force, the direction of the plate, the thickness of bone and skin, and Poisson's ratio of each model get
+errors drawn with their stated standard deviations, and the models have a coarser mesh than the truth. Three models,
+whose fat is stiffer or softer at random, are compared with a measurement whose error is drawn from the error model of
+the Gauss-Newton engine. The intervals should hold the area of each model with right inputs, on the mesh of the truth.
+
+The result is the coverage of the intervals; the pairs in the wrong order among those called significantly different;
+and the number of pairs called so (power). All is repeated with the inputs taken as exact. Skin is hardly strained here,
+so its areas do not count. The measurement follows its error model, so only the models are tested. Cases that are
+already in the file are not run again.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     python -m benchmarks.representation --out benchmarks/results/representation.json
 
-Measured is the true maximum shear strain of Load1 in voxels of 2 mm, with a bias and noise drawn from the error model
-of gauss-newton-borders (0.8 mm, SNR 25). Compared are the true field, 0.9, 1.2 and 1.5 times that, the true fields of
-the smooth load and of Load3, and no strain, each by the uncertainty carried through to each coefficient and by the one
-that CWA 16799 gives to all.
+The measurement is the true maximum shear strain of Load1 in voxels of 2 mm, with bias and noise drawn from the error
+model of gauss-newton-borders (0.8 mm, SNR 25). It is compared with the true field, with 0.9, 1.2 and 1.5 times that,
+with the true fields of the smooth load and of Load3, and with no strain: by the uncertainty of each coefficient, and by
+the one uncertainty that CWA 16799 gives to all.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Do error bars hold on motions that nobody foresaw? Pairs moved by finite-element models of other tissues and plates.
+"""Error bars on motions that were not foreseen: pairs moved by finite-element models of other tissues and plates.
 
     python -m benchmarks.unforeseen --work FOLDER --out benchmarks/results/unforeseen.json   # hours on one core
 
-A heel phantom is meshed whole, and pressed and sheared by the plate of the published experiment, with tissues of its
-own for each kind of motion; images of both states are formed and registered by each engine. The shipped error models,
-which know no such motion, are judged by the share of voxels whose true maximum shear strain (that of the mesh) lies
-within 1.96 standard deviations, by tissue and near bone, and by the share of true figures in their intervals. Two
-motions of the accuracy study, on a heel that it did not have, are beside them. What is in the work folder is not made
-again, so that two processes may share the work (--heels).
+A whole phantom heel is meshed, and pressed and sheared by the plate of the published experiment, with another set of
+tissues for each kind of motion. Images of both states are made and registered by each engine. The shipped error models
+were not made from such motions. They are judged by the fraction of voxels whose true maximum shear strain (that of the
+mesh) lies within 1.96 standard deviations, by tissue and near bone, and by the fraction of true figures in their
+intervals. Two motions of the accuracy study, on a heel that it did not use, are given for comparison. Results in the
+work folder are not computed again, so two processes may share the work (--heels).
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ def whole_folder(final: Path) -> Iterator[Path]:
 
 
 def _put_in_place(partial: Path, final: Path) -> None:
-    """Give a folder its final name; an older one of that name stays until then."""
+    """Move a complete folder to its final name; an older folder of that name stays until then."""
     if not final.exists():
         partial.replace(final)
         return
@@ -97,7 +97,7 @@ def _put_in_place(partial: Path, final: Path) -> None:
 
 
 def _remove_left(final: Path) -> None:
-    """Remove what processes that were killed had begun to write as this folder, or had put aside for it."""
+    """Remove incomplete and replaced copies of this folder that killed processes left behind."""
     left = re.compile(rf"\.{re.escape(final.name)}\.\w{{8}}\.(partial|old)")
     for folder in final.parent.iterdir():
         if left.fullmatch(folder.name):

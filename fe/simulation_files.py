@@ -94,8 +94,7 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
 def begin_simulation(folder: Path) -> None:
     """Remove the files of an earlier simulation, listed in its own record, so that old and new are never mixed.
 
-    The record then has no load until the simulation ends: the last file of a load that was written before may be that
-    of a part of it.
+    Until the simulation ends, its record names no load, since the last file may hold only a part of a load.
     """
     loads = list[str]()
     with suppress(OSError, ValueError, KeyError, TypeError):  # there is none, or it is damaged

@@ -28,9 +28,10 @@ _LEAST_VOLUME, _LEAST_SHARE = 0.2, 0.1  # of a cell whose nodes are moved, over 
 
 
 def with_force(load: LoadStep, relative: float, newton: float = 0.0) -> LoadStep:
-    """A load whose forces are larger by a relative and an absolute (N) standard uncertainty, in square.
+    """A load whose forces are larger by one standard uncertainty, with a relative and an absolute part (N).
 
-    Prescribed plate displacements, and forces of zero, stay as they are.
+    The two parts are combined as the root of the sum of squares. Prescribed plate displacements and forces of zero are
+    unchanged.
     """
 
     def larger(force: float | None) -> float | None:
@@ -40,7 +41,7 @@ def with_force(load: LoadStep, relative: float, newton: float = 0.0) -> LoadStep
 
 
 def tilted(plate: Plate, degrees: float, *, along: bool) -> Plate:
-    """A plate whose normal is tilted, with its direction of shear: ``along`` the direction of shear, or across it."""
+    """A plate whose normal and direction of shear are tilted, ``along`` the direction of shear or across it."""
     axes = plate.axes  # normal force, shear, third
     turn = Rotation.from_rotvec(np.deg2rad(degrees) * axes[:, 2 if along else 1]).as_matrix()
     return replace(plate, normal=-turn @ axes[:, 0], shear=turn @ axes[:, 1])
@@ -55,7 +56,7 @@ def with_compressibility(materials: Materials, relative: float) -> dict[str, Mat
 
 
 def with_stiffness(materials: Materials, region: str, relative: float) -> dict[str, Material]:
-    """Materials of which that of one region is stiffer by a relative standard uncertainty, at every strain."""
+    """Materials with one region stiffer by a relative standard uncertainty, at every strain."""
     if region not in materials:
         raise InputError(f"The mesh has no region '{region}', whose stiffness is uncertain; it has {list(materials)}.")
     law, vector = materials[region], materials[region].vector.copy()
@@ -67,7 +68,7 @@ def with_stiffness(materials: Materials, region: str, relative: float) -> dict[s
 def with_bone(mesh: TetMesh, thickness_mm: float) -> tuple[TetMesh, float]:
     """A mesh whose bone is thicker; nodes move, and cells stay the same.
 
-    Returns also the fraction of the thickness by which it moved: less than 1 if cells would have become too flat.
+    Also returns the fraction of the thickness that was reached: less than 1 if cells would have become too flat.
     """
     every = np.arange(len(mesh.cells))
     return _moved(mesh, *_normals(mesh, every, _keys(mesh, mesh.facets[BONE])), -thickness_mm)
@@ -87,7 +88,7 @@ def from_base(
 ) -> list[LoadState]:  # fmt: skip
     """Solve each load of a changed problem from the state of that load in the unchanged one.
 
-    Mesh topology and axes of the plate have to be those of the unchanged problem. Loads without a state are left out.
+    Mesh topology and axes of the plate must be those of the unchanged problem. Loads without a state are skipped.
     """
     states = []
     for load in problem.loads:

@@ -62,6 +62,12 @@ def _frame(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArra
     return a, b
 
 
+def _set_frame(motion: object, *names: str) -> None:
+    """Replace two attributes of a frozen motion by perpendicular unit vectors, read-only."""
+    for name, vector in zip(names, _frame(*(getattr(motion, name) for name in names)), strict=True):
+        object.__setattr__(motion, name, vector)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ShearWave:
     """Simple shear whose amount varies as a cosine: u = (peak L / 2 pi) sin(2 pi n . X / L + phase) d.
@@ -93,8 +99,7 @@ class ShearWave:
     phase: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, vector in zip(("direction", "normal"), _frame(self.direction, self.normal), strict=True):
-            object.__setattr__(self, name, vector)
+        _set_frame(self, "direction", "normal")
         if not (np.isfinite(self.wavelength_mm) and self.wavelength_mm > 0 and np.isfinite(self.peak)):
             raise InputError(f"A wave needs a positive wavelength in mm; got {self.wavelength_mm} and {self.peak}.")
 
@@ -156,8 +161,7 @@ class ShearStar:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre_mm", frozen(self.centre_mm, np.float64))
-        for name, vector in zip(("along", "normal"), _frame(self.along, self.normal), strict=True):
-            object.__setattr__(self, name, vector)
+        _set_frame(self, "along", "normal")
         lengths = self.shortest_mm, self.longest_mm, self.length_mm
         if not (np.isfinite([*lengths, self.amplitude_mm]).all() and min(lengths) > 0):
             raise InputError(f"A star needs positive periods and a positive length in mm; got {lengths}.")
@@ -230,8 +234,7 @@ class Bending:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre_mm", frozen(self.centre_mm, np.float64))
-        for name, vector in zip(("length", "thickness"), _frame(self.length, self.thickness), strict=True):
-            object.__setattr__(self, name, vector)
+        _set_frame(self, "length", "thickness")
         if not (np.isfinite(self.radius_mm) and self.radius_mm > 0):
             raise InputError(f"The bending radius must be positive, mm; got {self.radius_mm}.")
 

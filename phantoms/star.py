@@ -85,11 +85,11 @@ class StarRow:
 
 
 def star_rows(measured: Deformation, pair: StarPair) -> list[StarRow]:
-    """What is recovered of the star, by tissue and rising period.
+    """Recovered fraction of the star, by tissue and rising period.
 
-    Of the displacement, on the middle plane, where it is the amplitude everywhere; of the shear strain E_dn
-    (Green-Lagrange), a quarter of a period to either side, where it is largest. Both are means over the direction in
-    which the star does not vary.
+    That of the displacement is taken on the middle plane, where the true displacement is the amplitude everywhere, and
+    that of the shear strain E_dn (Green-Lagrange) a quarter of a period to either side, where it is largest.
+    Both are means over the direction in which the star does not vary.
     """
     star, rows = pair.star, list[StarRow]()
     grid = pair.labels.grid

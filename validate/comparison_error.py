@@ -140,8 +140,8 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
         tuple((one.model, one.figure, *(_cell(v) for v in astuple(one)[4:])) for one in shown),
         "S: simulated; D: measured, with the bias of the measurement removed. Standard uncertainties from the mesh "
         "(u_num), the other inputs of the model (u_input) and the measurement (u_D); u_val is the root of the sum of "
-        "their squares, of those that are known. Interval: E ± 2 u_val; that of the area is its 95 % interval. Strains "
-        "have no unit, volumes and areas are in mL. Tissues are in comparison_error.csv.",
+        "the squares of those that are known. Interval: E ± 2 u_val; that of the area is its 95 % interval. Strains "
+        "have no unit, volumes and areas are in mL. Single tissues are in comparison_error.csv.",
     )  # fmt: skip
     return [Section(f"{load}, validation uncertainty", None, (table,), paragraphs=tuple(words), folded=True)]
 

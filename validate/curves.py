@@ -159,7 +159,7 @@ class Band:
         return self.varied_ml.get(model, self.areas_ml[model]) - self.areas_ml[model]
 
     def _widened(self, drawn: FloatArray, added: FloatArray) -> tuple[float, float, float]:
-        """Lower end, median and upper end of draws: 2.5th and 97.5th percentile, both uncertainties in square.
+        """Lower end, median and upper end of draws: 2.5th and 97.5th percentile, from both uncertainties.
 
         Only the part of the measurement is widened; the widening was determined for it.
         """

@@ -1,8 +1,8 @@
 """Image decomposition in 3D (CWA 16799:2014): fields on the cells of one tissue as a few orthonormal coefficients.
 
 The functions are polynomials of rising total degree, made orthonormal on the cells of the tissue, weighted by volume
-(as the adaptive geometric moment descriptors of Christian and others 2021 are on the points of a surface). So many are
-taken as the measured field needs: until the residual of its reconstruction is accepted.
+(as the adaptive geometric moment descriptors of Christian and others 2021 are on the points of a surface). The
+degree rises until the residual of the measured field's reconstruction is accepted.
 """
 
 from collections.abc import Iterator, Mapping
@@ -147,7 +147,7 @@ class Decomposition:
         Standard uncertainty of the measured field, root mean square over the tissue.
     estimate, spread : (k,)
         Mean of the coefficients of the true fields drawn, which removes the bias of the measurement, and their standard
-        uncertainty: the measurement's, carried through to each coefficient.
+        uncertainty: the measurement uncertainty, propagated to each coefficient.
     """
 
     degree: int
@@ -214,8 +214,8 @@ def probability_of_representation(
 ) -> float:  # fmt: skip
     """Probability that predictions represent the measurement within its uncertainty, 0 to 1.
 
-    The share of the coefficients' errors (k,) that are not larger than the ``expanded`` uncertainty, (k,) or one for
-    all, in the sum of all errors: each error counts by its size. 1 where no error is larger.
+    The sum of the coefficients' errors (k,) that are within the ``expanded`` uncertainty, (k,) or one for all, over the
+    sum of all errors: each error is weighted by its size. 1 if no error exceeds its uncertainty.
 
     References
     ----------

@@ -151,10 +151,10 @@ class LoadComparison:
     model_forms : tuple of ModelForm
         Modified area validation metric, by model and tissue.
     bands, decompositions : mapping of tissue to Band, to Decomposition
-        Empty where the measurement uncertainty is unknown. Each tissue is decomposed for itself, since strain is
+        Empty where the measurement uncertainty is unknown. Each tissue is decomposed separately, since strain is
         discontinuous at interfaces.
     errors : tuple of ComparisonError
-        Comparison error of each figure, with its uncertainties; empty likewise.
+        Comparison error of each figure, with its uncertainties; empty if the measurement uncertainty is unknown.
     """
 
     case: LoadCase

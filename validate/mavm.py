@@ -1,6 +1,6 @@
 """Modified area validation metric: by how much measured strain is larger, and by how much smaller, than simulated.
 
-The distributions are those of strain over the volume of a tissue: the cells are all of it, and not samples of it.
+The distributions are those of strain over the volume of a tissue. The cells are the whole tissue, not samples of it.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ def safety_factor(samples: int | None) -> float:
     """Factor F_s on the interval of a model, for a measured distribution known from ``samples`` experiments.
 
     F_s = 1.25 + 1.2 (4 - 1.25) / N^(1/3), and 1 where the distribution is complete (None). Independent experiments
-    count, such as subjects: the cells of one measured field are no samples. InputError below two.
+    count, such as subjects: the cells of one measured field are not samples. InputError below two.
     """
     if samples is None:
         return 1.0

@@ -112,8 +112,8 @@ def changes_of(
     -----
     A variant on the same cells as its base changes them one by one: the change is that of the cell at the point, or of
     the nearest cell outside the mesh. Its nodes may have been moved. Between two meshes the strain of single cells
-    differs by scatter, which says nothing of the strain-volume curve. There the change is that of the quantile: in each
-    tissue, by how much the strain that as much of the volume exceeds differs. Of several variants of one
+    differs by scatter that does not affect the strain-volume curve. There the change is that of the quantiles: in each
+    tissue, the difference between the strains that the same fraction of the volume exceeds. Of several variants of one
     input, such as one increased and one decreased, the mean is taken.
     """
     cells: dict[object, tuple[OnMesh, np.ndarray]] = {}

@@ -77,8 +77,8 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
     """Sentences on the best model in the largest tissue."""
     if not one.decompositions:
         return (
-            "The measurement has no error model, so its uncertainty is unknown, and fields are not decomposed: whether "
-            "a model represents the measurement within its uncertainty cannot be said.",
+            "The measurement has no error model, so its uncertainty is unknown and fields are not decomposed: it is "
+            "not known whether a model represents the measurement within its uncertainty.",
         )
     names = [a.model for a in one.ranked()] or list(one.fields.models)
     tissue = next(iter(one.decompositions))
@@ -86,12 +86,13 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
     best, nothing = rows[names[0]], rows[NOTHING]
     return (
         f"{best.model}: the strain in {tissue} represents the measurement within its uncertainty with a probability of "
-        f"{best.probability:.0%} ({best.in_band} of {best.coefficients} coefficients); a model without deformation, of "
-        f"{nothing.probability:.0%}.",
+        f"{best.probability:.0%} ({best.in_band} of {best.coefficients} coefficients); for a model without "
+        f"deformation it is {nothing.probability:.0%}.",
         _accepted(best),
-        f"CWA 16799 gives one uncertainty to all coefficients; with it {best.model} has {best.guide_probability:.0%}, "
-        f"and a model without deformation {nothing.guide_probability:.0%}. In three dimensions that band is wide "
-        "beside most coefficients, so the first figure, with the uncertainty of each coefficient, says more.",
+        f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "
+        f"{best.guide_probability:.0%} for {best.model} and {nothing.guide_probability:.0%} for a model without "
+        "deformation. In three dimensions this band is wider than most coefficients, so the first probability, "
+        "with an uncertainty for each coefficient, is more informative.",
     )
 
 
@@ -101,7 +102,7 @@ def _accepted(of: Representation) -> str:
     figures = f"residual {of.u_rec:.3f}, measurement uncertainty {of.u_cal:.3f}, {clusters}"
     if of.accepted:
         return f"{functions}, as the guide asks ({figures})."
-    what = "The probability holds for the part of the strain that these coefficients show."
+    what = "The probability applies only to the part of the strain that these coefficients represent."
     return f"{functions}, which the guide does not accept ({figures}). {what}"
 
 
@@ -121,7 +122,7 @@ def _representations(one: LoadComparison) -> Table:
         "Probability that the simulated maximum shear strain represents the measured one within its uncertainty "
         "(Dvurecenska and others 2018), from coefficients of orthonormal functions on the tissue's cells. In band: "
         "coefficients within the expanded uncertainty of each. Accepted: the residual of the measured field is within "
-        "the measurement uncertainty, and not above three times itself in connected cells of 0.3 % of the tissue.",
+        "the measurement uncertainty, and no cluster of residuals above three times that fills 0.3 % of the tissue.",
         cells(nothing=True),
     )  # fmt: skip
 
@@ -139,6 +140,6 @@ def _model_forms(one: LoadComparison) -> Table:
         cells(nothing=False),
         "Over all strains, as measured: d+ is the area between the distributions where the measured maximum shear "
         "strain is the larger, d− where it is the smaller (Voyles and Roy 2015). Every percentile of the model has the "
-        "interval that its mean has here, from − d− to + d+. Cells are no samples: there is no factor for few samples.",
+        "interval that its mean has here, from − d− to + d+. Cells are not samples: no factor for few samples is used.",
         cells(nothing=True),
     )

@@ -84,13 +84,13 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
     notes, ends = list[str](), _without_labels(image, body, spacing, reach)
     whole, fixed = body | ends, within(ends, spacing, reach)
     if ends.any():
-        notes.append("Boundaries stay where the labels end in tissue that has none.")
+        notes.append("Boundaries are unchanged where the labels end inside tissue.")
     new_skin = skin
     if skin.any():
         near_bone = distance_transform_edt(~bones, sampling=spacing) <= reach if bones.any() else bones
         found = Skin.of(even, Mask(grid, whole), near_bone | ends)
         if found is None:
-            notes.append("The boundary of skin stays: the image shows no darker layer at the surface of the body.")
+            notes.append("The skin is unchanged: the image shows no darker layer at the surface of the body.")
         else:
             at_border = (np.abs(depth_mm(whole & ~skin, spacing)) <= reach) & ~fixed
             new_skin = np.where(at_border & ~bones, found.probability > 0.5, skin) & body
@@ -116,7 +116,7 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
 
 
 def correctable(labels: LabelMap) -> tuple[BoolArray, BoolArray]:
-    """Bones and skin, whose boundaries `correct_labels` corrects; InputError if no voxel is of either."""
+    """Voxels (ni, nj, nk) of bones and of skin, which `correct_labels` corrects; InputError if there are none."""
     names = labels.names.items()
     bones = np.isin(labels.labels, [number for number, name in names if is_bones_name(name)])
     skin = np.isin(labels.labels, [number for number, name in names if name.casefold() == "skin"])

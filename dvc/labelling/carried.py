@@ -1,4 +1,4 @@
-"""Another subject's label map, carried over to an image by registration, and combined with what the image shows."""
+"""Another subject's label map, transferred to an image by registration and combined with what the image shows."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,15 +26,15 @@ from dvc.threads import usable_cores
 
 # Two subjects: textures differ, so a stiff spline; neither volume nor the shape of a bone is kept.
 ENGINE = GaussNewton(bending=10.0, volume=0.0, rigidity=0.0)
-_OFF_MM = 1.0  # standard deviation of a border that is carried over
-_LEAST_COVERED = 0.8  # of the body by the labels that were carried over
+_OFF_MM = 1.0  # standard deviation of a boundary that is transferred
+_LEAST_COVERED = 0.8  # of the body by the transferred labels
 _LEAST_SHARE = 0.2  # of a tissue in the image: what is found there may be wrong
 _LEAST_CHANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarriedLabels:
-    """A label map on another subject's image, with the probability (n, ni, nj, nk) of each of its labels."""
+    """A label map transferred to another subject's image, with the probability (n, ni, nj, nk) of each label."""
 
     labels: LabelMap
     probability: Float32Array
@@ -47,10 +47,10 @@ def labels_from(
 ) -> TissueLabels:  # fmt: skip
     """Label the tissues of an unloaded image, given another subject's image and its label map.
 
-    The label map is carried over by an affine and a non-rigid registration. Its bone is corrected by the image
+    The label map is transferred by an affine and a non-rigid registration. Its bone is corrected by the image
     (`correct_labels`), and skin, fat, muscle and other bones are found from it (`label_tissues`). The probability of a
-    label is that of its tissue in the image times that of the label that was carried over. A tissue that the image does
-    not show by itself, such as tendon, lies where it was carried to.
+    label is that of its tissue in the image times that of the transferred label. A tissue that the image alone does
+    not show, such as tendon, stays where the registration puts it.
 
     Parameters
     ----------
@@ -61,11 +61,11 @@ def labels_from(
     labels : LabelMap
         Tissues of the other image, on any grid of its frame. One is named like a bone.
     bone : Mask, optional
-        The bone, if it is known, on any grid of the image's frame; it is then kept as it is.
+        The bone, if it is known, on any grid of the image's frame; it is kept unchanged.
     body : Mask, optional
         The body in the image. Default: found by an intensity threshold.
     watch : callable, optional
-        Told how far it is, from 0 to 1.
+        Called with the fraction that is done, 0 to 1.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def labels_from(
     """
     if not set(bones_of(labels)) & set(labels.names.values()):
         raise InputError(
-            "No label of the other subject is named like a bone, such as calcaneus, so no bone can be carried over. "
+            "No label of the other subject is named like a bone, such as calcaneus, so no bone can be transferred. "
             "Check the names (names)."
         )
     whole = fit_mask(body, image.grid, "body") if body is not None else tissue_mask(image)
@@ -95,10 +95,10 @@ def labels_from(
 def carry_labels(
     image: Image, other: Image, labels: LabelMap, body: Mask, watch: Callable[[float], None] = lambda _: None
 ) -> CarriedLabels:
-    """Carry another subject's label map over to the body in an image; arguments as in `labels_from`, on their grids.
+    """Transfer another subject's label map to the body in an image; arguments as in `labels_from`, on their grids.
 
-    The probability is that of a label whose border is off by 1 mm (standard deviation). RegistrationError if they
-    cover less than .8 of the body.
+    The probability is that of a label whose boundary is off by 1 mm (standard deviation). RegistrationError if the
+    labels cover less than 80 % of the body.
     """
     theirs = Mask(other.grid, labels.labels > 0)
     affine = affine_fit(without_bias_field(image), without_bias_field(other), body, theirs)
@@ -120,7 +120,7 @@ def combined(
     image: Image, other: Image, labels: LabelMap, carried: CarriedLabels, bone: Mask | None, body: Mask,
     watch: Callable[[float], None] = lambda _: None,
 ) -> TissueLabels:  # fmt: skip
-    """Labels that were carried over (`carry_labels`), combined with the tissues that the image shows in the body."""
+    """Transferred labels (`carry_labels`), combined with the tissues that the image shows in the body."""
     (name, *_), known = bones_of(labels), bone
     if known is None:
         known = correct_labels(image, carried.labels, lambda share: watch(0.4 * share)).labels.region(name)
@@ -180,10 +180,10 @@ def _groups(found: TissueLabels, other: Image, labels: LabelMap, bone: str) -> M
 
 
 def _weighed(found: TissueLabels, carried: CarriedLabels, groups: Mapping[str, list[int]]) -> TissueLabels:
-    """Tissues found in the image, with the labels that were carried over as what is known beforehand (Bayes).
+    """Tissues found in the image, with the transferred labels as the prior (Bayes).
 
-    The probability of a label is that of its tissue in the image, at least a fifth, times that of the label where it
-    was carried to; the bone is known.
+    The probability of a label is that of its tissue in the image, at least a fifth, times that of the transferred
+    label; the bone is known.
     """
     grid, numbers = found.labels.grid, [*carried.labels.names]
     names, known = dict(carried.labels.names), found.labels.region(NAMES[1]).inside

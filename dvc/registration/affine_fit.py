@@ -15,10 +15,10 @@ _FIRST_STEP_MM, _LAST_STEP_MM, _STEPS, _SHORTER = 2.0, 1e-3, 100, 0.6
 
 
 def affine_fit(reference: Image, other: Image, body: Mask, other_body: Mask) -> Affine:
-    """The affine map, LPS mm, from a reference image to another one that correlates best with it.
+    """Affine map, LPS mm, from points of a reference image to those of another image, by the highest correlation.
 
-    It begins where the centroids of the two bodies, masks on the grids of the images, lie on each other. Axes toward
-    L, P and S have to be roughly the same in both. RegistrationError if the images do not overlap.
+    The search starts with the centroids of the two bodies (masks on the grids of the images) on each other, so both
+    must lie roughly in the same orientation. RegistrationError if the images do not overlap.
     """
     fit, start, middle = sitk.ImageRegistrationMethod(), sitk.AffineTransform(3), body.points().mean(axis=0)
     start.SetCenter(middle.tolist())

@@ -1,4 +1,4 @@
-"""What every page of this package is made of: its templates, its scripts by their hashes, and what it may not do."""
+"""Parts that all HTML pages share: templates, packed data, and the content security policy."""
 
 import base64
 import gzip
@@ -28,9 +28,9 @@ def packed(content: bytes) -> str:
 
 
 def policy(style: str, scripts: Sequence[str], *, viewer: bool = False) -> str:
-    """What a browser lets a page do: run and apply what was written here, by its hash, and fetch nothing.
+    """Content security policy of a page: only its own scripts and style run, by their hashes, and nothing is fetched.
 
-    A page with the 3-D ``viewer`` also compiles WebAssembly, and reads what it unpacked itself.
+    A page with the 3-D ``viewer`` may also compile WebAssembly, and read what it has unpacked.
     """
     run = " ".join([*map(_hash, scripts), *(["'wasm-unsafe-eval'"] if viewer else [])])
     images, more = ("data: blob:", "; worker-src blob:; connect-src data: blob:") if viewer else ("data:", "")

@@ -74,7 +74,7 @@ class Picture:
 
     @property
     def alt(self) -> str:
-        """What it shows, for a person who does not see it: its title, and the first sentence of the caption."""
+        """Text for screen readers: its title, and the first sentence of the caption."""
         first = self.caption.partition(". ")[0].removesuffix(".")
         return f"{self.title}: {first}." if first else self.title
 

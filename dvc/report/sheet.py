@@ -51,7 +51,7 @@ def letters(direction: npt.ArrayLike) -> str:
 
 
 def tilt_deg(grid: Grid, plane: Plane) -> float:
-    """Angle between the plane and the grid's slices that are shown for it, degrees; 0 where it is not worth telling."""
+    """Angle between the plane and the grid's slices that are shown for it, degrees; 0 if it is negligible."""
     cut = AXES[plane][0]
     tilt = float(np.degrees(np.arccos(np.clip(grid.toward_lps().direction[cut, cut], -1.0, 1.0))))
     return tilt if tilt > OBLIQUE_DEG else 0.0

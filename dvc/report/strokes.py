@@ -14,7 +14,7 @@ from dvc.report.sheet import AXES, LETTERS, PLANES, Plane, tilt_deg
 from dvc.report.style import TISSUES, looks
 
 MARKED = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "other"}
-"""Names of marks that have none of their own, by number; "other" is any tissue that stands out from muscle."""
+"""Names of marks by number, if they have none of their own; "other" is any tissue that stands out from muscle."""
 STROKES = "strokes.nii.gz"
 """The file that the page saves."""
 _GREYS = 64  # steps of the image: with its noise, 256 take half as much room again
@@ -26,7 +26,7 @@ _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 def write_strokes_page(path: Path, name: str, image: Image) -> None:
     """Write a page on which strokes of tissues (`MARKED`) are drawn on an image.
 
-    One HTML file without anything to fetch. A browser saves the strokes as NIfTI: 8 bits, on the image's grid, voxel
+    The page is one HTML file and loads nothing else. It saves the strokes as NIfTI: 8 bits, on the image's grid, voxel
     by voxel as they were drawn. Slices are cut along the image's own axes and shown as radiologists read them.
     OutputError if the file cannot be written.
 
@@ -35,7 +35,7 @@ def write_strokes_page(path: Path, name: str, image: Image) -> None:
     path : Path
         The page.
     name : str
-        File name of the image, which the page tells.
+        File name of the image, shown on the page.
     image : Image
         Its values are kept in 64 steps of grey; missing ones are black.
     """

@@ -36,7 +36,7 @@ def label(
     draw: Annotated[
         Path | None,
         typer.Option(
-            help="Write only a page (.html) on which strokes for --marks are drawn in a browser, offline.",
+            help="Write only a page (.html) for drawing the strokes of --marks in a browser, offline.",
             rich_help_panel="Output",
         ),
     ] = None,
@@ -44,7 +44,7 @@ def label(
 ) -> None:  # fmt: skip
     """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks.
 
-    Or carry another subject's label map over (--from with --labels), or correct one of this image (--labels alone).
+    With --from and --labels, transfer another subject's label map; with --labels alone, correct one of this image.
     """
     from dvc.errors import InputError
 

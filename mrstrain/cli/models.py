@@ -82,8 +82,8 @@ def compare(
     variants: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder with results of a model with one input changed, and a variant.toml; or a folder of such "
-            "folders. They give the input uncertainty. Repeat for several.",
+            help="Folder of a variant (results of a model with one input changed, and a variant.toml), or of several "
+            "variants. They give the input uncertainty. Repeat for several.",
             rich_help_panel="Model",
         ),
     ] = None,

@@ -77,7 +77,7 @@ def run(
         list[str] | None, typer.Option(help="Stages to run again, by kind or name. Repeat for several.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Leave out the further solutions for the input uncertainty of the models.")
+        bool, typer.Option("--quick", help="Skip the variants that give the input uncertainty of the models.")
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be done.")] = False,
     report_only: Annotated[bool, typer.Option("--report-only", help="Only write the report again.")] = False,

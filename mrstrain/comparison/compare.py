@@ -78,7 +78,7 @@ def compare(
     labelling, reading, directions, comparison
         Their fields are given as keywords, such as ``strains=...``.
     variants : sequence of path
-        Folders with results of the models with one input changed, each with a ``variant.toml``, or folders of such
+        Folders of variants (results of a model with one input changed, and a ``variant.toml``), or folders of such
         folders. They give the input uncertainty of the models.
     remarks : sequence of str
         Sentences for the notes of the report.

@@ -1,6 +1,6 @@
-"""What a comparison holds for an assessment of credibility after ASME V&V 40 and FDA, as a section of a report.
+"""Evidence of a comparison for a credibility assessment after ASME V&V 40 and FDA, as a section of a report.
 
-The program tells what it knows and grades nothing: question, context of use, risk and levels are a person's.
+The program fills in what it knows and grades nothing: a person states question, context of use, risk and levels.
 
 References
 ----------
@@ -19,6 +19,7 @@ import numpy as np
 from dvc import Verdict
 from dvc.report.page import Section, Table
 from fe import Tolerance
+from mrstrain.comparison.methods import models_with
 from mrstrain.comparison.model_facts import ModelFacts, facts_of, used_for_calibration
 from mrstrain.measurement.acquisition import NOT_GIVEN
 from mrstrain.options.credibility import CredibilityOptions
@@ -28,9 +29,9 @@ from validate import ALL, NOTHING, Comparison
 TITLE = "Credibility (ASME V&V 40, FDA)"
 """Title of the section of a report."""
 _ABOUT = (
-    "What this report holds for an assessment of credibility after ASME V&V 40-2018 and FDA's guidance of 17 November "
-    "2023. The program fills in what it knows, and grades nothing: a person judges levels and risk. What only a person "
-    "can tell is in the study file, under [credibility], and is not given until it is there."
+    "Evidence in this report for a credibility assessment after ASME V&V 40-2018 and FDA's guidance of 17 November "
+    "2023. The program fills in what it knows and grades nothing: a person judges levels and risk. All else comes from "
+    "the study file, under [credibility]; what is missing there is not given."
 )
 CODE = (
     "Order of convergence to a closed form of nearly incompressible tissue, of the displacement and its gradient: P1 "
@@ -111,7 +112,7 @@ def _evidence(held: Holdings) -> Table:
     """FDA's eight categories of evidence."""
     given, others = held.given, held.of_kind("other")
     own = f"mrstrain {versions()['mrstrain']}. {CODE}"
-    foreign = f"Nothing is known here of the code of {_names(others)}" if others else ""
+    foreign = f"Code verification of {_names(others)}: {NOT_GIVEN}" if others else ""
     calibrated = used_for_calibration(held.models)
     found = f"{len(calibrated)} found, listed below" if calibrated else "none found in the records"
     by_person = _by_person(given.calibration)
@@ -123,11 +124,11 @@ def _evidence(held: Holdings) -> Table:
         ("5. Population-based validation results", _sentences("One subject here", _by_person(given.population))),
         ("6. Emergent model behavior", _told(given.emergent_behaviour)),
         ("7. Model plausibility", _sentences(_plausible(held), _by_person(given.plausibility))),
-        ("8. Calculation verification and UQ results", _sentences(_calculated(held), _inputs_sure(held))),
+        ("8. Calculation verification and UQ results", _sentences(_calculated(held), _uncertainties(held))),
     )  # fmt: skip
     note = (
-        "Categories of FDA's guidance. A comparison counts as in vivo only if the subject is alive: a phantom's is a "
-        "test of the program, a specimen's a bench test."
+        "Categories of FDA's guidance. A comparison counts as in vivo only with a living subject: with a phantom it is "
+        "a test of the program, with a specimen a bench test."
     )
     return Table("Evidence by category", ("category", "what this report holds"), rows, note)
 
@@ -142,7 +143,7 @@ def _validation(held: Holdings) -> str:
 
 
 def _areas(held: Holdings, comparison: Comparison) -> str:
-    """The area of each model over all loads; of those that take the measured displacement, it is said."""
+    """The area of each model over all loads; models with measured boundary conditions are marked as such."""
     driven = {one.name: " with measured boundary conditions" for one in held.of_kind("driven")}
     areas = [a for a in comparison.ranking.areas if not a.levelled] or [
         a for a in comparison.areas if a.tissue == ALL and a.model != NOTHING and not a.levelled
@@ -178,21 +179,19 @@ def _solved(held: Holdings) -> str:
     return f"Residual forces at each converged increment: at most {force}; {reached}"
 
 
-def _inputs_sure(held: Holdings) -> str:
+def _uncertainties(held: Holdings) -> str:
+    """Which uncertainties are in the intervals of the comparison."""
     if held.comparison is None:
         return f"Uncertainty of the comparison: {NOT_GIVEN}"
     known = any(not np.isnan(area.low_ml) for area in held.comparison.areas)
-    measured = "is in the intervals" if known else NOT_GIVEN
-    errors = held.comparison.errors
-    by_mesh = dict.fromkeys(e.model for e in errors if not np.isnan(e.u_num))
-    by_input = dict.fromkeys(e.model for e in errors if not np.isnan(e.u_input))
-    return (
-        f"Uncertainty of the measurement: {measured}. Uncertainty of the meshes (u_num): {_in_intervals(by_mesh)}. "
-        f"Uncertainty of the inputs of the models (u_input): {_in_intervals(by_input)}"
-    )
+    by_input, by_mesh = models_with(held.comparison, "u_input"), models_with(held.comparison, "u_num")
+    return _sentences(
+        f"Measurement uncertainty: {'in the intervals' if known else NOT_GIVEN}",
+        f"Input uncertainty: {_in_intervals(by_input)}", f"Error of the mesh: {_in_intervals(by_mesh)}",
+    )  # fmt: skip
 
 
-def _in_intervals(models: Collection[str]) -> str:
+def _in_intervals(models: Sequence[str]) -> str:
     return f"in the intervals of {', '.join(models)}" if models else NOT_GIVEN
 
 
@@ -202,7 +201,7 @@ def _calibration(held: Holdings) -> Table:
     nothing = ("Nothing was found in the records", "", "")
     note = (
         "Found in the records of the models. Bones are rigid in the models, and in the measurement their motion is "
-        "removed: agreement at the bone is no evidence. Models that were meshed from the label map of the measurement "
+        "removed: agreement at the bone is not evidence. Models that were meshed from the label map of the measurement "
         "share its errors."
     )
     columns = ("data", "used for", "so it cannot validate")
@@ -261,7 +260,7 @@ def _factors(held: Holdings) -> Table:
 
 
 def _equivalent(held: Holdings) -> str:
-    """Whether models and measurement had the same inputs, as far as the comparison can tell."""
+    """Whether models and measurement had the same inputs, as far as the comparison shows."""
     if held.comparison is None:
         return NOT_GIVEN
     verdict = held.comparison.verdict

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -82,7 +82,7 @@ def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
 
 
 def _acquired(measured: Mapping[str, Path]) -> list[str]:
-    """How the images were acquired, if their headers tell."""
+    """How the images were acquired, if their headers describe it."""
     return [told] if (told := acquisition_sentence(measured)) else []
 
 
@@ -256,14 +256,19 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
     )
 
 
+def models_with(comparison: Comparison, uncertainty: Literal["u_num", "u_input"]) -> list[str]:
+    """Models for which this part of the validation uncertainty is known."""
+    known = (error.model for error in comparison.errors if not np.isnan(getattr(error, uncertainty)))
+    return list(dict.fromkeys(known))
+
+
 def _of_inputs(comparison: Comparison) -> str:
-    """How the uncertainty of the models' inputs was carried through; empty where none was given."""
-    by_mesh = dict.fromkeys(e.model for e in comparison.errors if not np.isnan(e.u_num))
-    by_input = dict.fromkeys(e.model for e in comparison.errors if not np.isnan(e.u_input))
+    """How the input uncertainty of the models was propagated; empty if none was given."""
+    by_mesh, by_input = models_with(comparison, "u_num"), models_with(comparison, "u_input")
     if not by_mesh and not by_input:
         return ""
-    parts = [f"inputs of {_listed(list(by_input))}"] * bool(by_input)
-    parts += [f"the mesh of {_listed(list(by_mesh))} (grid convergence index, Roache 1994)"] * bool(by_mesh)
+    parts = [f"inputs of {_listed(by_input)}"] * bool(by_input)
+    parts += [f"the mesh of {_listed(by_mesh)} (grid convergence index, Roache 1994)"] * bool(by_mesh)
     return (
         f"The uncertainty of {' and of '.join(parts)} was propagated linearly, from a further solution with each input "
         "changed, and is part of these intervals. The comparison error E = S - D and its standard uncertainties u_num, "

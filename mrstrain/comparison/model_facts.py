@@ -1,4 +1,4 @@
-"""What the records beside a model's results tell of it: how it was computed, and from what it was calibrated."""
+"""How a model was computed, and what it was calibrated with, from the records beside its results."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,17 +14,28 @@ from validate import LEVELLED
 Kind = Literal["simulated", "driven", "levelled", "other"]
 FITTED = " fitted to "
 """What the title of a material set that `fit` made has between the model's and the curve's name."""
+_TAKEN_FROM_THE_MEASUREMENT = {
+    "driven": (
+        "measured displacement of the surface", "boundary conditions",
+        "displacement of the skin and near it; only the strain inside is predicted",
+    ),
+    "levelled": (
+        "unloaded image and registration", "simulated measurement of the model",
+        "the measurement: what it smooths away is missing from both sides",
+    ),
+}  # fmt: skip
+"""By kind of model: the data, what they were used for, and what they cannot validate."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
-    """A model as its records tell it.
+    """A model according to its records.
 
     Attributes
     ----------
     kind : str
-        "simulated" under a plate, "driven" by the measured displacement of its surface, "levelled" (simulated as the
-        measurement would see it), or "other": of another program.
+        "simulated" under a plate, "driven" by the measured displacement of its surface, "levelled" (warped and
+        registered like the measurement), or "other" (of another program).
     laws : mapping of str to str
         Constitutive model of each region.
     title : str
@@ -82,28 +93,14 @@ def facts_of(folders: Mapping[str, Path]) -> tuple[ModelFacts, ...]:
 
 
 def used_for_calibration(models: Sequence[ModelFacts]) -> list[tuple[str, str, str]]:
-    """What models took from data: the model and the data, what they were used for, and what they cannot validate."""
+    """Data that models were calibrated with: model and data, what they were used for, and what they cannot validate."""
     rows = [
         (f"{one.name}: {one.title}", "material parameters", f"the stress of the tests in {one.fitted_to}")
         for one in models
         if one.fitted_to
     ]
-    rows += [
-        (
-            f"{one.name}: measured displacement of the surface", "boundary conditions",
-            "displacement of the skin and near it; only the strain inside is predicted",
-        )
-        for one in models
-        if one.kind == "driven"
-    ]  # fmt: skip
-    rows += [
-        (
-            f"{one.name}: unloaded image and registration", "simulated measurement of the model",
-            "the measurement: what it smooths away is missing from both sides",
-        )
-        for one in models
-        if one.kind == "levelled"
-    ]  # fmt: skip
+    for kind, (data, use, invalid) in _TAKEN_FROM_THE_MEASUREMENT.items():
+        rows += [(f"{one.name}: {data}", use, invalid) for one in models if one.kind == kind]
     moved = {step.name: step for one in models for step in one.steps if (step.normal_mm, step.shear_mm) != (None, None)}
     rows += [
         (

@@ -49,7 +49,11 @@ class ModelFile:
 
         Its variants are read when they are needed.
         """
-        result = self._read(grid)
+        try:
+            result = self._read()
+        except ExtentError as failure:
+            raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
+        check_overlap(self.path, result.mesh, grid)
         reads = {of: of.deformation for one in self.variants if (of := one.base) is not None}  # each base once
         variants = tuple(
             Variant(one.input, one.steps, one.varied.deformation, None if one.base is None else reads[one.base])
@@ -59,18 +63,11 @@ class ModelFile:
 
     def deformation(self) -> OnMesh:
         """The deformation alone; errors as `read_result`."""
-        mesh, unit, frame = self.reading.model_mesh, self.reading.model_unit, self.reading.model_frame
-        how = {"mesh": mesh, "unit": unit, "frame": frame, "to_image": self.to_image}
-        return read_result(self.name, self.path, **how).deformation  # type: ignore[arg-type]
+        return self._read().deformation
 
-    def _read(self, grid: Grid) -> FeResult:
+    def _read(self) -> FeResult:
         mesh, unit, frame = self.reading.model_mesh, self.reading.model_unit, self.reading.model_frame
-        try:
-            result = read_result(self.name, self.path, mesh=mesh, unit=unit, frame=frame, to_image=self.to_image)
-        except ExtentError as failure:
-            raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
-        check_overlap(self.path, result.mesh, grid)
-        return result
+        return read_result(self.name, self.path, mesh=mesh, unit=unit, frame=frame, to_image=self.to_image)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""How images were acquired and measured: what headers, records and a study file tell, as a table and as a sentence."""
+"""How images were acquired and measured, from headers, records and a study file: as a table and as a sentence."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # it draws
 TITLE = "Acquisition and measurement"
 """Title of the section of a report."""
 NOT_GIVEN = "not given"
-"""In place of what neither a file nor a person tells."""
+"""Shown for a value that no file gives."""
 ACQUIRED = "Images were acquired"
 """How the sentence of the methods text begins."""
 _SCANS, _NOISE = "scans", "noise"  # in provenance.json
@@ -31,10 +31,11 @@ _PARAMETERS = {
     "flip_angle_deg": "Flip angle, degrees", "acquisition_matrix": "Matrix of the acquisition",
 }  # fmt: skip
 _NOTE = (
-    "Header: DICOM, or the JSON file of dcm2niix beside a NIfTI file. Of its texts, only known names of scanners and "
-    "sequences are shown, so that no patient is named. A study file can give the rest, under [acquisition]. SNR: 75th "
-    "percentile of the tissue over the standard deviation of the noise. Standard uncertainty: standard deviation of "
-    "the error. The spatial resolution was measured on phantoms only (benchmark record, Spatial resolution)."
+    "Header: DICOM, or the JSON file of dcm2niix beside a NIfTI file. Its texts are shown only if they are known "
+    "names of scanners and sequences, so that no patient is named. A study file can give the rest, under "
+    "[acquisition]. SNR: 75th percentile of the tissue over the standard deviation of the noise. Standard uncertainty: "
+    "standard deviation of the error. The spatial resolution was measured on phantoms only (benchmark record, Spatial "
+    "resolution)."
 )
 _WEIGHTS = {"bending": "1/mm", "volume": "1/mm³", "rigidity": "1/mm³", "volume_gradient": "1/mm"}
 _SPLINE_ALONE = "none but the control point spacing"
@@ -43,7 +44,7 @@ _Row = tuple[str, str, str]
 
 
 def scans_record(unloaded: tuple[Path, Image], loads: Mapping[str, tuple[Path, Image]]) -> dict[str, object]:
-    """What provenance keeps of the acquisition of each image: matrix, voxel size (mm), and what its header tells."""
+    """Acquisition of each image for provenance.json: matrix, voxel size (mm), and the parameters in its header."""
     return {
         _SCANS: {
             name: {
@@ -56,7 +57,7 @@ def scans_record(unloaded: tuple[Path, Image], loads: Mapping[str, tuple[Path, I
 
 
 def noise_record(measured: "Measurement") -> dict[str, object]:
-    """What provenance keeps of the noise of a pair: the SNR of both images, and the median standard uncertainty."""
+    """Noise of a pair for provenance.json: SNR of both images, and median standard uncertainty of the max. shear."""
     found = None if measured.source is None else measured.source.registration
     reference, loaded = (None, None) if found is None else found.noise
     snr = {"unloaded": reference, "loaded": loaded}
@@ -76,7 +77,7 @@ def acquisition_section(folders: Mapping[str, Path], given: AcquisitionOptions |
 
 
 def acquisition_sentence(folders: Mapping[str, Path], given: AcquisitionOptions | None = None) -> str:
-    """A paragraph of a methods section on the acquisition; empty if neither a header nor a person tells of it."""
+    """A paragraph of a methods section on the acquisition; empty if no header and no study file describes it."""
     known = _Known.read(folders, given)
     told = {name: known.in_a_sentence(name) for name in _PARAMETERS}
     if all(value == NOT_GIVEN for value in told.values()):
@@ -101,7 +102,7 @@ def acquisition_sentence(folders: Mapping[str, Path], given: AcquisitionOptions 
 
 
 class _Known:
-    """What the records of measured loads and a person tell, by image."""
+    """Acquisition parameters by image, from the records of measured loads and from the study file."""
 
     def __init__(self, records: Mapping[str, Record], qualities: Mapping[str, Record], given: AcquisitionOptions):
         self.qualities, self.given = qualities, given
@@ -127,7 +128,7 @@ class _Known:
         return _together({name: read(scan) for name, scan in self.scans.items()})
 
     def parameter(self, name: str) -> tuple[str, str]:
-        """A parameter of the acquisition, and where it is from; both sources where they do not agree."""
+        """A parameter of the acquisition and its source; both values if header and study file differ."""
         of_header, by_person = self.images(lambda scan: scan.get(name)), _text(getattr(self.given, name))
         if of_header == NOT_GIVEN:
             return by_person, "" if by_person == NOT_GIVEN else "study file"
@@ -136,14 +137,14 @@ class _Known:
         return of_header, "header"
 
     def in_a_sentence(self, name: str) -> str:
-        """A parameter as the headers that have it tell it, or else as the person does."""
+        """A parameter from the headers that have it, or else from the study file."""
         values = self._told_by_headers(name)
         if len(values) < 2:
             return next(iter(values), _text(getattr(self.given, name)))
         return " and ".join(f"{value} ({', '.join(of)})" for value, of in values.items())
 
     def _told_by_headers(self, name: str) -> dict[str, list[str]]:
-        """The values that headers tell, each with its images."""
+        """Values from headers, each with its images."""
         values: dict[str, list[str]] = {}
         for image, scan in self.scans.items():
             if (value := _text(scan.get(name))) != NOT_GIVEN:
@@ -189,7 +190,7 @@ class _Known:
 
     @staticmethod
     def _measured(words: str, value: str, given: str | float | None = None, source: str = "images") -> _Row:
-        """A row with what was measured here, and what a person measured otherwise."""
+        """A row with the value measured here, and that of the study file if there is one."""
         own = _text(given)
         if value == NOT_GIVEN:
             return words, own, "" if own == NOT_GIVEN else "study file"

@@ -97,7 +97,7 @@ class Series:
     ) -> Self:  # fmt: skip
         """Write the provenance of a series and its report, one self-contained page.
 
-        It begins with the sections ``first``, if there are any, and the loads are then folded; ``more`` end it.
+        The sections ``first`` come before those of the loads, which are then folded; ``more`` come last.
         """
         told = [case.section for case in cases]
         told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]

@@ -1,4 +1,4 @@
-"""A command of the user's, such as a segmenter: run to its end, with nothing of it left however this process ends."""
+"""A user's command, such as a segmenter: it and all that it starts end with this process, however that ends."""
 
 import os
 import subprocess
@@ -32,16 +32,16 @@ except ProcessLookupError:
 
 
 def run_command(parts: Sequence[str], folder: Path, goes_on: Callable[[float], None]) -> tuple[int, str]:
-    """Run a command, which may use all cores and cannot ask anything; its status, and the end of what it printed.
+    """Run a command, which may use all cores and cannot ask questions; return its status and the end of its output.
 
     Parameters
     ----------
     parts : sequence of str
         The command and its arguments.
     folder : path
-        In which it runs.
+        Folder in which it runs.
     goes_on : callable
-        Told the seconds since its begin, every 5 s, as long as it computes: not while it hangs.
+        Called every 5 s with the seconds since the start, if the command has used processor time: not while it hangs.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def run_command(parts: Sequence[str], folder: Path, goes_on: Callable[[float], N
 
 @contextmanager
 def _guarded(running: "subprocess.Popen[bytes]") -> Iterator[None]:
-    """End a command, and all that it started, with this block or with this process, even if that is killed."""
+    """End a command and all that it started with this block, or with this process, even if it is killed."""
     if not hasattr(os, "killpg"):  # no groups of processes
         try:
             yield

@@ -1,4 +1,4 @@
-"""`draw_strokes`: a page on which the strokes are drawn that `label` takes as marks."""
+"""`draw_strokes`: a page for drawing the strokes that `label` takes as marks."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +19,12 @@ class StrokesPage(Outcome):
 
 @checked
 def draw_strokes(load0: Path | str, *, out: Path | str) -> StrokesPage:
-    """Write a page on which strokes are drawn in the tissues of an unloaded image, in any browser and offline.
+    """Write a page for drawing strokes in the tissues of an unloaded image, in any browser and offline.
 
     Parameters
     ----------
     load0 : path
-        Unloaded image, which the page holds.
+        Unloaded image; the page contains it.
     out : path
         The page, .html. It saves the strokes as strokes.nii.gz on the image's grid: ``marks`` of `label`.
 

@@ -52,7 +52,7 @@ def label(
         The bone, or the mark of one, is required, unless ``labels`` are given; as in `dvc.label_tissues`.
     drawn
         Instead, ``labels`` of this image, which are corrected as in `dvc.correct_labels`; or ``labels`` of another
-        subject's image (``from_image``), which are carried over as in `dvc.labels_from`.
+        subject's image (``from_image``), which are transferred as in `dvc.labels_from`.
     watch
         As in `dvc.label_tissues`.
 
@@ -102,13 +102,13 @@ def _from_another(
     image: Image, bone: Mask | None, body: Mask | None, strokes: Marks, drawn: GivenLabels,
     tell: Callable[[float], None],
 ) -> TissueLabels:  # fmt: skip
-    """Labels of another subject carried over to the image."""
+    """Labels of another subject, transferred to the image."""
     if drawn.labels is None:
         what = "names are those of a label map" if drawn.from_image is None else "from_image needs its label map"
         raise InputError(f"{what} (labels), which is not given. For marks, use mark_names.")
     if strokes.paths:
         raise InputError(
-            "Give marks or another subject's labels, not both. Where the labels come out wrong, correct them by hand."
+            "Give marks or another subject's labels, not both. If the labels are wrong somewhere, correct them by hand."
         )
     assert drawn.from_image is not None
     other, theirs = read_image(drawn.from_image), read_labels(drawn.labels, drawn.names)

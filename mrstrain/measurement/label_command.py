@@ -29,7 +29,7 @@ def labelled_by_command(
     load0 : path
         Unloaded image, in place of ``{image}`` in the command.
     command : str
-        It is run without a shell, in the folder of the image; what it writes to ``{labels}`` (.nii.gz) is read.
+        The command, run without a shell in the folder of the image. It writes ``{labels}`` (.nii.gz).
     names : path, optional
         Table of the names of the command's labels.
     out : path
@@ -37,7 +37,7 @@ def labelled_by_command(
     sha256 : str
         Hash of the command, for a record.
     watch : callable, optional
-        Told now and then that the command goes on, from 0 to 1.
+        Called with an estimate of the fraction that is done, 0 to 1, while the command computes.
 
     Raises
     ------

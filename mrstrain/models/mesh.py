@@ -107,9 +107,9 @@ def mesh_coarser(
     labels: Path, *, out: Path, ratio: float, labelling: Labelling, meshing: Meshing,
     watch: Callable[[float], None] | None = None,
 ) -> Meshed:  # fmt: skip
-    """Mesh a label map with edges that are longer by a ratio, and with voxels as much larger, if no tissue is lost.
+    """Mesh a label map with edges that are longer by a ratio, and voxels larger by it unless a tissue would be lost.
 
-    In thin tissues the voxels and not the edge length limit the size of the cells. The label map with these voxels is
+    In thin tissues, the voxels limit the size of the cells, not the edge length. The label map with these voxels is
     written next to the mesh. Other parameters and errors as in `mesh`.
     """
     longer = meshing.model_copy(update={"edge_mm": ratio * meshing.edge_mm})

@@ -1,7 +1,7 @@
-"""`vary`: further solutions of a material set with one input changed, for the input uncertainty of the model.
+"""`vary`: variants of a material set, each with one input changed, for the input uncertainty of the model.
 
-All are computed on a coarser mesh if there is one, and each is compared with the solution on that mesh, which also
-gives the error of the discretisation. Solutions with another force, material or interface start from its states.
+All are solved on a coarser mesh if there is one, and compared with the solution on that mesh, which also gives the
+discretisation error. Variants with another force, material or interface start from its converged states.
 """
 
 import shutil
@@ -72,7 +72,7 @@ def vary(
     voxel_mm : float
         Edge of a voxel of the label map.
     tell : callable
-        Called with what is done and the fraction of all that is done.
+        Called with the current step and the fraction of the whole that is done.
     """
     (chosen,) = material_sets(simulation.sets)
     place, how = (mesh, coordinates) if coarse is None else (coarse, options.MeshCoordinates())
@@ -123,7 +123,7 @@ def vary(
 
 
 def _remove_others(out: Path, names: Sequence[str]) -> None:
-    """Remove solutions of inputs that are exact by now, which would be compared otherwise."""
+    """Remove variants of inputs that are now exact, which would otherwise be compared."""
     for place in out.iterdir() if out.is_dir() else ():
         if place.is_dir() and place.name not in names:
             shutil.rmtree(place)
@@ -204,7 +204,7 @@ def _tilts(setting: _Setting, spread: Uncertainty) -> dict[str, dict[str, tuple[
 
 
 def _record_mesh(folder: Path, name: str, fine: TetMesh, coarse: TetMesh) -> str:
-    """Record the solution on the coarser mesh as a variant, unless the meshes are too much alike; what was found."""
+    """Record the solution on the coarser mesh as a variant, unless the meshes are too similar; return a sentence."""
     ratio = fe.cell_size_mm(coarse) / fe.cell_size_mm(fine)
     told = f"mesh: cells of {fe.cell_size_mm(fine):.2f} and {fe.cell_size_mm(coarse):.2f} mm, a ratio of {ratio:.2f}"
     if ratio < _LEAST_RATIO:

@@ -1,4 +1,4 @@
-"""What a person tells of the acquisition, where no header does."""
+"""Parameters of the acquisition that a person states because no header has them."""
 
 from typing import ClassVar
 
@@ -29,8 +29,8 @@ class AcquisitionOptions(Options):
     acquisition_matrix: Said = None
     """Samples along frequency and phase encoding, such as 256 x 192; an image may be interpolated to more voxels."""
     snr: Positive | None = None
-    """Signal-to-noise ratio, if it was measured otherwise than from the images."""
+    """Signal-to-noise ratio, if it was not measured from the images."""
     noise_floor: Said = None
-    """Noise floor of the strain, if it was measured otherwise than by the repeat scan."""
+    """Noise floor of the strain, if it was not measured by the repeat scan."""
     spatial_resolution: Said = None
     """Spatial resolution of the strain on these images, and how it was measured."""

@@ -1,4 +1,4 @@
-"""What only a person can tell of the credibility of a model, after ASME V&V 40-2018 and FDA's guidance of 2023."""
+"""A person's statements on the credibility of a model, after ASME V&V 40-2018 and FDA's guidance of 2023."""
 
 from typing import ClassVar, Literal
 
@@ -30,7 +30,7 @@ class CredibilityOptions(Options):
     risk_rationale: Said = None
     """Why these three are as given."""
     calibration: Said = None
-    """What the model was calibrated with elsewhere, so that it is no evidence of validity."""
+    """Data that the model was calibrated with elsewhere, which are no evidence of validity."""
     bench_tests: Said = None
     """Comparisons with tests on the bench, such as with a phantom of known material."""
     population: Said = None
@@ -70,7 +70,7 @@ class CredibilityOptions(Options):
 
     @property
     def lacking(self) -> list[str]:
-        """Names of the fields that nobody has filled in; of all levels one stands for all, if none is given."""
+        """Names of the fields that are not filled in; if no level is given, one entry stands for all levels."""
         lacking = [name for name, value in self if value is None]
         levels = [name for name in type(self).model_fields if name.startswith("level_")]
         if not set(levels) <= set(lacking):

@@ -53,13 +53,13 @@ class Marks(Options):
 
 
 class GivenLabels(Options):
-    """A label map that was drawn: of this image, to be corrected, or of another subject's, to be carried over."""
+    """A drawn label map: of this image, to be corrected, or of another subject's, to be transferred."""
 
     panel: ClassVar[str] = "Inputs"
 
     labels: Path | None = None
-    """A label map. Without --from, of this image, to be corrected: the boundaries of its bones and skin move to where
-    the image shows them, by up to 2.5 voxels. With --from, of that image, to be carried over to this one."""
+    """Label map. Without --from, it is that of this image and is corrected: the boundaries of its bones and skin move
+    to where the image shows them, by up to 2.5 voxels. With --from, it is that of that image and is transferred."""
     names: Path | None = None
     """Table of its label names: ITK-SNAP, Slicer or CSV."""
     from_image: Annotated[Path | None, Cli(name="--from")] = None

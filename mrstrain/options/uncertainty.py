@@ -21,11 +21,11 @@ class Uncertainty(Options):
 
     mesh: NotNegative = 0.0
     """Ratio of the edge lengths of a coarser mesh to those of the mesh, such as 1.4, to estimate the error of the
-    mesh; all solutions with a changed input are computed on it, too."""
+    mesh; all variants are then solved on it."""
     force: NotNegative = 0.0
     """Of the plate's forces, relative."""
     force_n: NotNegative = 0.0
-    """Of the plate's forces, N, in addition."""
+    """Of the plate's forces, N; combined with ``force`` as the root of the sum of squares."""
     direction_deg: NotNegative = 0.0
     """Of the plate's normal, in each of the two directions of tilt, degrees."""
     poisson: NotNegative = 0.0
@@ -33,11 +33,11 @@ class Uncertainty(Options):
     stiffness: dict[str, NotNegative] = Field(default_factory=dict)
     """Of the stiffness of a tissue, relative, by the name of the tissue."""
     labels_voxels: NotNegative = 0.0
-    """Of the boundary of the bone, and of the inside of the skin, in voxels of the label map that is meshed."""
+    """Of the boundary of the bone and of the inner surface of the skin, in voxels of the label map that is meshed."""
     variants: Annotated[tuple[Path, ...], AfterValidator(_different)] = ()
     """Folders with variants of the models of other codes, each with a ``variant.toml``."""
     quick: Flag = False
-    """Leave the further solutions out."""
+    """Skip the variants."""
 
     @field_validator("mesh")
     @classmethod
@@ -50,13 +50,13 @@ class Uncertainty(Options):
 
     @property
     def solves(self) -> bool:
-        """Whether there are further solutions to compute."""
+        """Whether there are variants to solve."""
         given = (self.mesh, self.force, self.force_n, self.direction_deg, self.poisson, self.labels_voxels)
         return not self.quick and bool(any(given) or any(self.stiffness.values()))
 
     @property
     def solutions(self) -> tuple[int, int]:
-        """Number of whole further solutions of a material set, and of those that start from another, about."""
+        """About how many variants of a material set are solved as a whole, and how many from a converged state."""
         whole = bool(self.mesh) + 2 * bool(self.direction_deg)
         moved = 2 * bool(self.labels_voxels)
         changed = sum(map(bool, (self.force or self.force_n, self.poisson, *self.stiffness.values())))

@@ -68,7 +68,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     looked.at_loaded(reference)
     if labels is not None and told.models.results:
         looked.tried(looked.at_results, labels)
-    looked.at_what_a_person_tells()
+    looked.at_report_details()
     planned = looked.tried(plan, told)
     if planned is not None and not looked.wrong:
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
@@ -175,11 +175,11 @@ class _Look:
         return labels
 
     def at_correction(self, labels: LabelMap) -> None:
-        """Report labels of which `correct_labels` has no boundary to correct, or that of bones or skin alone."""
+        """Report if `correct_labels` has no boundary to correct, or only those of bones or only that of skin."""
         there = self.tried_at("images", "correct_labels", correctable, labels)
-        for lacking, name in zip(there or (), ("like a bone", "skin"), strict=False):
-            if not lacking.any():
-                self.notes.append(f"WARNING: no label is named {name}, so correct_labels leaves its boundary.")
+        for part, name, other in zip(there or (), ("like a bone", "skin"), ("skin", "bones"), strict=False):
+            if not part.any():
+                self.notes.append(f"WARNING: no label is named {name}, so correct_labels corrects only {other}.")
 
     def at_marks(self, reference: Image | None) -> None:
         """Check the marks for the label map, among which the bone must be if there is no mask of it."""
@@ -319,8 +319,8 @@ class _Look:
                 "named skin."
             )
 
-    def at_what_a_person_tells(self) -> None:
-        """Note what of the acquisition and of the credibility is not given; nothing of it is required."""
+    def at_report_details(self) -> None:
+        """Note which keys of [acquisition] and [credibility] are not given; none is required."""
         place = self.study.path(self.study.images.load0)
         told = read_scan_parameters(place).known() | self.study.acquisition.model_dump(exclude_none=True)
         lacking = {

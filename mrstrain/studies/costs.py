@@ -159,8 +159,8 @@ def costs(
     if further := [stage for stage in left if stage.kind == "vary" or stage.name == COARSE]:
         added = duration(sum(seconds_of(stage, study, voxels, cells) for stage in further) / workers)
         lines.append(
-            f"Of these, {len(further)} stages are further solutions for the input uncertainty of the models, about "
-            f"{added}; `mrstrain run --quick` leaves them out."
+            f"Of these, {len(further)} stages give the input uncertainty of the models and take about {added}; "
+            "`mrstrain run --quick` skips them."
         )
     if disk > free:
         lines.append(f"{CARE}: there is too little free disk space.")

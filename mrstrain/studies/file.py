@@ -59,7 +59,7 @@ class Images(SubjectFiles):
     correct_labels: Flag = False
     """Whether the boundaries of bones and skin in the label map move to where the image shows them."""
     labels_command: str | None = None
-    """With labels = "auto": a segmenter, run instead; it takes {image} and writes {labels}."""
+    """With labels = "auto": the command of a segmenter, which takes {image} and writes {labels}."""
     bone_label: str | None = Field(default=None, validation_alias="bone")
     """Name of the bone's label, for the rigid alignment; by default "bone"."""
     bone: Path | None = Field(default=None, validation_alias="bone_mask")
@@ -72,7 +72,7 @@ class Images(SubjectFiles):
     @model_validator(mode="after")
     def _of_auto(self) -> Self:
         if self.allow_missing and self.correct_labels:
-            raise ValueError("'correct_labels' needs an image without missing voxels, so not allow_missing = true")
+            raise ValueError("'correct_labels' needs an image without missing voxels; leave out allow_missing = true")
         if self.labels != AUTO:
             if self.marks or self.mark_names or self.labels_command:
                 raise ValueError("'marks', 'mark_names' and 'labels_command' are only for labels = \"auto\"")
@@ -87,7 +87,7 @@ class Images(SubjectFiles):
         elif self.names is not None:
             raise ValueError("'names' is not for labels = \"auto\", which has names of its own")
         elif self.allow_missing:
-            raise ValueError('labels = "auto" needs an image without missing voxels, so not allow_missing = true')
+            raise ValueError('labels = "auto" needs an image without missing voxels; leave out allow_missing = true')
         return self
 
 
@@ -182,8 +182,8 @@ class Study(_Part):
         """A key of a table with its line in the file, for messages."""
         return _named(self._lines, table, key)[1]
 
-    def quickly(self) -> Self:
-        """The same without the further solutions for the input uncertainty of the models."""
+    def without_variants(self) -> Self:
+        """The same study without the variants for the input uncertainty of the models."""
         return self.model_copy(update={"uncertainty": self.uncertainty.model_copy(update={"quick": True})})
 
     @property

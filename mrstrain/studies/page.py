@@ -115,9 +115,8 @@ def _strain(section: Section) -> list[Picture]:
 
 
 def _side_by_side(study: Study, outcomes: Mapping[str, StageOutcome]) -> list[Picture]:
-    """The picture of the measured strain of all loads; none if a file that it is drawn from is no longer there."""
-    place = study.out / REGISTRATION
-    measured = {load: place / load for load in study.loads if outcomes[f"register {load}"].record is not None}
+    """The picture of the measured strain of all loads; none if one of its files is missing."""
+    measured = _folders(study, outcomes)
     if not measured:
         return []
     try:
@@ -126,7 +125,7 @@ def _side_by_side(study: Study, outcomes: Mapping[str, StageOutcome]) -> list[Pi
             study.path(study.images.load0), study.subject_files, MeshAndAxes(**onto.model_dump()),
             allow_missing=study.images.allow_missing,
         )  # fmt: skip
-        return [measured_by_load(subject, measured).save(place / FIGURE)]
+        return [measured_by_load(subject, measured).save(study.out / REGISTRATION / FIGURE)]
     except MrstrainError:
         return []
 

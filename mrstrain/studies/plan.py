@@ -195,7 +195,7 @@ def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
 
 
 def coarser(study: Study) -> bool:
-    """Whether a coarser mesh is made for the further solutions; a mesh that is given has none."""
+    """Whether a coarser mesh is made for the variants; a given mesh has none."""
     return study.uncertainty.solves and bool(study.uncertainty.mesh) and study.mesh.file is None
 
 

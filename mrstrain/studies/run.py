@@ -91,7 +91,7 @@ def run(
     workers : int, optional
         Number of stages at the same time on this machine; by default one for each core.
     quick : bool
-        Leave out the further solutions for the input uncertainty of the models ([uncertainty]); the report says so.
+        Skip the variants for the input uncertainty of the models ([uncertainty]); the report says so.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
     on_report : callable, optional
@@ -121,7 +121,7 @@ def run(
 
 def _chosen(study: Path | str | Study, quick: bool) -> Study:
     told = read_study(study)
-    return told.quickly() if quick and told.uncertainty.solves else told
+    return told.without_variants() if quick and told.uncertainty.solves else told
 
 
 def run_studies(

@@ -20,7 +20,7 @@ Tell = Callable[[str, float], None]
 _REGISTERING = {"aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2)}
 # of a registration's time: when each of its parts begins, and how much of it the part takes
 _LEFT_OUT = (
-    "The further solutions for the input uncertainty of the models were left out (quick): intervals and significant "
+    "The variants for the input uncertainty of the models were skipped (quick): intervals and significant "
     "differences take mesh, forces, directions and parameters of simulated models as exact."
 )
 

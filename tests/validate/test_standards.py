@@ -54,7 +54,7 @@ def test_the_answer_comes_first_and_names_model_tissue_and_probability() -> None
     first, accepted, guide = answer(one)
     assert first == (
         "right: the strain in fat represents the measurement within its uncertainty with a probability of 100% (1 of 1 "
-        "coefficients); a model without deformation, of 0%."
+        "coefficients); for a model without deformation it is 0%."
     )
     assert "as the guide asks (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
     assert guide.startswith("CWA 16799 gives one uncertainty to all coefficients; with it right has 100%")

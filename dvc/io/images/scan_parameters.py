@@ -1,7 +1,7 @@
 """How an image was acquired, from its header: DICOM, or the JSON file that dcm2niix writes beside a NIfTI file.
 
-A header may name a patient, in any of its elements. Numbers are therefore taken within the limits of what scanners do,
-codes if the standard defines them, and text only if every word of it is that of a known scanner or sequence.
+Any element of a header may name a patient. Therefore numbers are taken only within the range of real scanners, codes
+only if the standard defines them, and text only if every word belongs to a known scanner or sequence.
 
 References
 ----------
@@ -73,7 +73,7 @@ _MS = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class ScanParameters:
-    """What a header tells of an MR acquisition; None for what it does not tell.
+    """Parameters of an MR acquisition from a header; None if the header does not give them.
 
     Attributes
     ----------
@@ -107,9 +107,9 @@ class ScanParameters:
 
 
 def read_scan_parameters(path: StrPath) -> ScanParameters:
-    """How an image was acquired, as far as its header, or the JSON file of dcm2niix beside it, tells.
+    """Read how an image was acquired, from its header or from the JSON file of dcm2niix beside it.
 
-    A file that cannot be read tells nothing: `dvc.read_image` says what is wrong with it.
+    A file that cannot be read gives no parameters; `dvc.read_image` reports what is wrong with it.
     """
     place, told = Path(path), dict[str, Any]()
     with suppress(OSError, ValueError, ImageFileError):
@@ -136,7 +136,7 @@ def _sidecar(place: Path) -> Path | None:
 
 
 def _of_sidecar(place: Path) -> dict[str, Any]:
-    """What dcm2niix wrote, by the names of DICOM and in ms."""
+    """Elements that dcm2niix wrote, under their DICOM names, times in ms."""
     sidecar = _sidecar(place)
     told = {} if sidecar is None else read_json(sidecar)
     times = {name: _number(told.get(name), 1e-6, 100.0) for name in ("RepetitionTime", "EchoTime")}

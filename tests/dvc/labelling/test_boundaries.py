@@ -85,7 +85,7 @@ def test_labels_that_end_in_tissue_keep_their_boundaries_there(heel: tuple[Image
     for slices in (slice(low, low + 2), slice(high - 2, high)):
         assert np.mean((made.labels.labels != labels)[:, :, slices][labels[:, :, slices] > 0]) < 0.01
     assert np.mean((made.labels.labels != labels)[labels > 0]) < 0.03
-    assert made.notes == ("Boundaries stay where the labels end in tissue that has none.",)
+    assert made.notes == ("Boundaries are unchanged where the labels end inside tissue.",)
 
 
 def test_skin_that_the_image_does_not_show_stays_and_is_told(heel: tuple[Image, LabelMap]) -> None:
@@ -93,7 +93,7 @@ def test_skin_that_the_image_does_not_show_stays_and_is_told(heel: tuple[Image, 
     even = np.where(truth.labels > 0, 500.0, 0.0) + np.random.default_rng(1).normal(0.0, 10.0, truth.labels.shape)
     made = correct_labels(Image(truth.grid, even.astype(np.float32)), truth)
     assert np.array_equal(made.labels.region("skin").inside, truth.region("skin").inside)
-    assert any("The boundary of skin stays" in note for note in made.notes)
+    assert any("The skin is unchanged" in note for note in made.notes)
 
 
 def test_what_has_no_border_to_correct_is_refused(heel: tuple[Image, LabelMap]) -> None:

@@ -52,8 +52,11 @@ def simulation(folder: Path, name: str, *, title: str = "", reached: float = 1.0
     return place.parent
 
 
-def comparison(*models: str, low: float = 0.5, reasons: tuple[str, ...] = ()) -> Any:
-    """A comparison of models under one load, each with an area of 1 mL."""
+def comparison(
+    *models: str, low: float = 0.5, reasons: tuple[str, ...] = (), inputs: dict[str, tuple[float, float]] | None = None
+) -> Any:
+    """A comparison of models under one load, each with an area of 1 mL, and u_num and u_input of some."""
+    errors = tuple(SimpleNamespace(model=m, u_num=num, u_input=by) for m, (num, by) in (inputs or {}).items())
     areas = tuple(
         SimpleNamespace(model=m, tissue=t, load="all loads", levelled=False, best_ml=1.0, low_ml=low, high_ml=1.5)
         for m in models
@@ -61,7 +64,6 @@ def comparison(*models: str, low: float = 0.5, reasons: tuple[str, ...] = ()) ->
     )
     ranking = SimpleNamespace(areas=areas[::3], statements=("Best match over all loads (area metric): trebbi.",))
     verdict = Verdict("caution", reasons) if reasons else Verdict("trust")
-    errors = tuple(SimpleNamespace(model=m, u_num=np.nan, u_input=np.nan) for m in models)
     return SimpleNamespace(areas=areas, ranking=ranking, strains=(0.2, 0.5), verdict=verdict, errors=errors)
 
 
@@ -75,18 +77,6 @@ def table(section: Section, title: str) -> Table:
 
 def rows(section: Section, title: str) -> dict[str, tuple[str, ...]]:
     return {str(row[0]): tuple(map(str, row[1:])) for row in table(section, title).rows}
-
-
-def test_uncertainty_of_mesh_and_inputs_is_that_of_the_comparison(tmp_path: Path) -> None:
-    made = comparison("trebbi", "ansys")
-    folders = {"trebbi": simulation(tmp_path, "trebbi")}
-    (none,) = rows(credibility_section(held(folders, comparison=made)), "Evidence by category")[f"8. {CATEGORIES[-1]}"]
-    assert f"(u_num): {NOT_GIVEN}" in none
-    assert f"(u_input): {NOT_GIVEN}" in none
-    made.errors[0].u_num, made.errors[1].u_input = 0.1, 0.2
-    (known,) = rows(credibility_section(held(folders, comparison=made)), "Evidence by category")[f"8. {CATEGORIES[-1]}"]
-    assert "(u_num): in the intervals of trebbi." in known
-    assert "(u_input): in the intervals of ansys." in known
 
 
 def test_all_categories_and_factors_stand_there_once_and_nothing_is_graded(tmp_path: Path) -> None:
@@ -121,7 +111,7 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     section = credibility_section(held(folders, comparison=comparison(*folders), subject="Heel 3"))
     evidence = {name[3:]: told for name, (told,) in rows(section, "Evidence by category").items()}
     assert CODE in evidence["Code verification results"]
-    assert "Nothing is known here of the code of ansys." in evidence["Code verification results"]
+    assert "Code verification of ansys: not given." in evidence["Code verification results"]
     vivo = evidence["In vivo validation results"]
     assert vivo.startswith("Verdicts on the measurement: Load1 Trust. Best match over all loads (area metric): trebbi.")
     assert "its interval of 95 % coverage: trebbi 1.00 (0.50 to 1.50), luboz 1.00 (0.50 to 1.50), ansys" in vivo
@@ -129,7 +119,10 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     assert calculated.startswith("Mesh convergence: not given (mrstrain converge)")
     assert MESH_DOUBT in calculated
     assert "reached in part: luboz Load1 40%" in calculated
-    assert "Uncertainty of the measurement: is in the intervals" in calculated
+    assert (
+        "Measurement uncertainty: in the intervals. Input uncertainty: not given. Error of the mesh: not given"
+        in calculated
+    )
     for name in ("Bench test validation results", "Emergent model behavior"):
         assert evidence[name] == NOT_GIVEN
     assert rows(section, "Applicability") == {
@@ -146,10 +139,21 @@ def test_without_intervals_or_a_comparison_nothing_is_claimed(tmp_path: Path) ->
     folders = {"trebbi": simulation(tmp_path, "trebbi")}
     told = str(credibility_section(held(folders, comparison=comparison("trebbi", low=np.nan))).tables)
     assert "trebbi 1.00 (no interval)" in told
-    assert "Uncertainty of the measurement: not given" in told
+    assert "Measurement uncertainty: not given" in told
     section = credibility_section(held(folders))
     assert rows(section, "Credibility factors")["Output comparison"][0] == NOT_GIVEN
     assert "Comparison with models: not given" in str(section.tables)
+
+
+def test_input_uncertainty_that_is_in_the_intervals_is_told_with_the_models_that_have_it(tmp_path: Path) -> None:
+    folders = {name: simulation(tmp_path, name) for name in ("trebbi", "luboz")}
+    one = comparison("trebbi", "luboz", inputs={"trebbi": (0.01, 0.02), "luboz": (np.nan, 0.01)})
+    told = rows(credibility_section(held(folders, comparison=one)), "Evidence by category")
+    (calculated,) = told["8. Calculation verification and UQ results"]
+    assert (
+        "Input uncertainty: in the intervals of trebbi, luboz. Error of the mesh: in the intervals of trebbi"
+        in calculated
+    )
 
 
 def test_mesh_convergence_takes_the_place_of_the_known_doubt(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ from mrstrain.cli.app import app
 from mrstrain.models.simulate import load_named, simulate as run
 from tests.blocks import block
 from tests.fe.test_mesh_names import abaqus, ansys
-from tests.fe.test_simulate import DOWN, FAT, PRESS, block_under_plate, dome, nodal_forces, press
+from tests.fe.test_plate_displacement import block_under_plate
+from tests.fe.test_simulate import DOWN, FAT, PRESS, dome, nodal_forces, press
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]

@@ -82,7 +82,7 @@ TABLES: dict[type[Options], tuple[str, str]] = {  # table of the study file, and
 NOT_IN_A_STUDY = {  # what a study has in its own way
     Scans: "repeat and allow_missing are keys of [images]; a start and landmarks belong to a single load",
     Marks: "marks are keys of [images]",
-    GivenLabels: "a label map is corrected or carried over before a study",
+    GivenLabels: "a label map is corrected or transferred before a study",
     BoneAndBody: "part of SubjectFiles",
     MeshAndAxes: "its directions are the plate's",
     Cores: "told when it is run",

@@ -1,4 +1,4 @@
-"""`check`: what `simulate` would refuse later is told now, and what a run takes grows with what it is made of."""
+"""`check`: problems that would stop a later stage are reported before a run."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from dvc.io.images.write import write_image, write_labels
 from dvc.mesh import TetMesh
 from fe import write_tet_mesh
 from mrstrain.cli.app import app
-from mrstrain.records.progress import duration
-from mrstrain.studies import costs, stages
+from mrstrain.studies import stages
 from mrstrain.studies.check import check, wrong_with
 from mrstrain.studies.file import read_study
-from mrstrain.studies.plan import Stage, plan
-from mrstrain.studies.run import _tell, forecast, run
+from mrstrain.studies.plan import plan
+from mrstrain.studies.run import forecast, run
 from tests.fe.test_simulate import dome
 
 GRID = Grid((16, 16, 16), (2.0, 2.0, 2.0), (-6.0, -6.0, -6.0))  # around the dome
@@ -149,7 +148,7 @@ def test_labels_without_a_boundary_to_correct_are_told(study):
     asked = ('names = "tissues.csv"', 'names = "tissues.csv"\ncorrect_labels = true')
     assert wrong(study, asked, ('"mine.toml", ', "")) == ""
     told = [note for note in check(study).notes if "correct_labels" in note]
-    assert told == ["WARNING: no label is named skin, so correct_labels leaves its boundary."]
+    assert told == ["WARNING: no label is named skin, so correct_labels corrects only bones."]
     values = np.ones(GRID.shape, dtype=np.int64)
     values[:4] = 2
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "heel"}))
@@ -232,63 +231,6 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
     )
     with pytest.raises(InputError, match="level = true needs a rigid bone"):
         plan(read_study(study))
-
-
-def test_larger_images_and_meshes_take_longer_and_more_memory(study):
-    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = false"))
-    told = read_study(study)
-    by_kind = {stage.kind: stage for stage in plan(told)}
-    small, large = 126.0 * 140 * 132, 256.0**3
-    registering, simulating = by_kind["register"], by_kind["simulate"]
-    assert costs.gib_of(registering, told, small, 0.0) == pytest.approx(
-        1.06, abs=0.05
-    )  # measured: .95 for 2.1 million, 2.08 for 7.1
-    assert costs.gib_of(registering, told, large, 0.0) == pytest.approx(3.5, abs=0.1)
-    assert costs.gib_of(registering, told, 384.0**3, 0.0) == pytest.approx(10.6, abs=0.5)
-    for count, measured in ((64, 13.2), (128, 23.0), (192, 48.9), (256, 100.0)):
-        assert costs.seconds_of(registering, told, count**3, 0.0) == pytest.approx(measured, rel=0.1)
-    elastix = STUDY.replace("[registration]", '[registration]\npreset = "heel-mr"')
-    for text, measured, needed in ((STUDY, 47.8, 1.42), (elastix, 44.2, 1.61)):
-        (study / "study.toml").write_text(text)
-        usual = read_study(study)
-        seconds, gib = (of(registering, usual, 128.0**3, 0.0) for of in (costs.seconds_of, costs.gib_of))
-        assert seconds == pytest.approx(measured, rel=0.1)
-        assert gib == pytest.approx(needed, rel=0.15)
-    assert costs.gib_of(simulating, told, 0.0, 79e3) == pytest.approx(1.2)
-    assert costs.gib_of(simulating, told, 0.0, 8 * 79e3) == pytest.approx(8.2)
-    assert costs.seconds_of(simulating, told, 0.0, 8 * 79e3) > 8 * costs.seconds_of(simulating, told, 0.0, 79e3)
-    (study / "study.toml").write_text(STUDY.replace("[models]", '[models]\nelement = "P2"'))
-    exact = read_study(study)
-    assert costs.seconds_of(simulating, exact, 0.0, 6e4) == pytest.approx(
-        20.0 * costs.seconds_of(simulating, told, 0.0, 6e4)
-    )
-    assert costs.gib_of(simulating, exact, 0.0, 6e4) > 2.0 * costs.gib_of(simulating, told, 0.0, 6e4)
-    (study / "study.toml").write_text(STUDY.replace("[models]", "[models]\nlimit_minutes = 0.25"))
-    limited = read_study(study)
-    (simulating, *_) = (stage for stage in plan(limited) if stage.kind == "simulate")
-    assert costs.seconds_of(simulating, limited, 0.0, 6e4) == 15.0  # one load, one path
-    times = {}
-    for name in ("friedman", "trebbi", "akrami"):  # the softer the fat, the longer
-        (study / "study.toml").write_text(STUDY)
-        one = replace(simulating, arguments={**simulating.arguments, "sets": (name,), "limit_s": None})
-        times[name] = costs.seconds_of(one, told, 0.0, 77e3)
-    assert times["friedman"] > 3.0 * times["trebbi"] > 9.0 * times["akrami"]
-
-
-def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
-    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = false"))
-    told = read_study(study)
-    load = next(stage for stage in plan(told) if stage.kind == "register")
-    left = [replace(load, name=f"register {k}") for k in range(4)]
-
-    def care(gib: float, workers: int = 3) -> list[str]:
-        monkeypatch.setattr(costs, "usable_memory_bytes", lambda: int(gib * 1024**3))
-        return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("WARNING")]
-
-    assert care(12.0) == []  # three of 3.9 GiB
-    assert care(8.0) == ["WARNING: this machine has 8.0 GiB of memory; run with workers=2 (--workers 2)."]
-    assert care(8.0, workers=2) == []
-    assert "Crop the images" in care(3.0)[0]
 
 
 def test_what_is_fixed_beside_the_bone_has_to_be_there_and_decides_what_is_done_anew(study):
@@ -404,33 +346,3 @@ def test_gaps_are_left_out_where_the_study_says_so(study):
     with pytest.raises(InputError, match="level = true"):
         forecast(study)
     assert forecast(study, only=("register",))["register Load1"] == "run"
-
-
-def test_what_a_machine_has_too_little_of_is_said_before_a_run_and_logged(caplog):
-    lines, logged = ["To do: 1 of 1 stages", "WARNING: this machine has 1.0 GiB of memory"], list[str]()
-    _tell(lines, logged.append)
-    assert logged == lines
-    assert caplog.messages == lines[1:]
-
-
-def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
-    (study / "study.toml").write_text(STUDY)
-    told = read_study(study)
-    first = next(stage for stage in plan(told) if stage.kind == "register")
-    row = [first]
-    for k in range(3):
-        row.append(replace(first, name=f"register {k}", after=(row[-1].name,)))
-    apart = [replace(first, name=f"register {k}") for k in range(4)]
-    one = costs.seconds_of(first, told, 1e6, 0.0)
-
-    def time(stages: list[Stage]) -> str:
-        return costs.costs(told, stages, stages, 1e6, 0.0, 8)[0].split("about ")[1].split(" on")[0]
-
-    assert time(apart) == duration(one)
-    assert time(row) == duration(4 * one)
-    assert [costs.expected(row, told, 1e6, 0.0)[stage.name].before for stage in row[1:]] == [
-        (stage.name,) for stage in row[:-1]
-    ]
-    levelled = replace(first, name="level trebbi Load1")
-    (study / "study.toml").write_text(STUDY + '[loads.Load2]\nimage = "Load1.nii.gz"\n')
-    assert costs.disk_bytes(levelled, read_study(study), 1e6) == costs.disk_bytes(levelled, told, 1e6)

@@ -1,4 +1,4 @@
-"""The input uncertainty of the models in a study: further solutions, cached, told by `check`, and left out."""
+"""The input uncertainty of the models in a study: variants, cached, announced by `check`, and skipped."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def planned(folder: Path, table: str, quick: bool = False) -> dict[str, Stage]:
     (folder / "soft.toml").write_text(SET)
     (folder / "study.toml").write_text(PLAIN + table)
     study = read_study(folder)
-    return {stage.name: stage for stage in plan(study.quickly() if quick else study)}
+    return {stage.name: stage for stage in plan(study.without_variants() if quick else study)}
 
 
 def test_further_solutions_are_stages_which_quick_leaves_out(tmp_path: Path) -> None:
@@ -94,8 +94,8 @@ def test_a_spread_that_cannot_be_is_refused_with_its_line(tmp_path: Path, line: 
 
 def test_check_tells_the_further_solutions_and_a_tissue_that_is_not_there(varied: Path) -> None:
     told = "\n".join(check(varied).summary())
-    assert "2 stages are further solutions for the input uncertainty of the models, about" in told
-    assert "`mrstrain run --quick` leaves them out" in told
+    assert "2 stages give the input uncertainty of the models and take about" in told
+    assert "`mrstrain run --quick` skips them" in told
     assert forecast(varied, quick=True)["compare"] == "run"
     assert "vary akrami" not in forecast(varied, quick=True)
     text = (varied / "study.toml").read_text()
@@ -121,7 +121,7 @@ def test_a_study_draws_its_inputs_and_says_what_each_adds(varied: Path) -> None:
     again = run(varied, workers=1)
     assert all(outcome.reused for outcome in again.outcomes.values())
     report = (varied / "results" / "report.html").read_text()
-    assert "were left out (quick)" not in report
+    assert "were skipped (quick)" not in report
     hurried = run(varied, workers=1, quick=True)
     assert hurried.complete
-    assert "were left out (quick)" in (varied / "results" / "report.html").read_text()
+    assert "were skipped (quick)" in (varied / "results" / "report.html").read_text()
