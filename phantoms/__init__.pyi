@@ -42,7 +42,7 @@ from .heel import (
 )
 from .motions import Bending, ShearStar, ShearWave, compressed, sheared, stretched
 from .mri import acquire, sensitivity
-from .star import Efficiency, StarPair, StarRow, efficiencies, resolved_mm, star_pair, star_rows, tissue_block
+from .star import Efficiency, StarPair, StarRow, efficiencies, resolved_mm, star_pair, star_rows, tissue_bar
 from .warp import Acquisition, SyntheticWarp, material_points, synthetic_warp
 
 __all__ = [
@@ -55,5 +55,5 @@ __all__ = [
     "floor_rows", "heel_grid", "heel_pair", "labels_of", "labels_to_mesh", "material_points", "measure_run",
     "misdrawn", "motion_named", "pressed", "random_foot_motion", "resolution_rows", "resolved_mm", "run_rows",
     "sampled_errors", "scan", "sensitivity", "sheared", "sliding", "star_pair", "star_rows", "stretched",
-    "swelling", "synthetic_warp", "tissue_block", "under_load", "under_plate", "wavelength_recovered",
+    "swelling", "synthetic_warp", "tissue_bar", "under_load", "under_plate", "wavelength_recovered",
 ]  # fmt: skip

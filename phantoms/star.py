@@ -1,4 +1,4 @@
-"""Spatial resolution and noise from one pair of images each: a star of shear in a block of fat and muscle.
+"""Spatial resolution and noise from one pair of images each: a star of shear in a bar of fat and muscle.
 
 Resolution, noise and their product are those of the DIC Challenge 2.0 (Reu and others, Exp Mech 2022,
 doi:10.1007/s11340-021-00806-6), with the motion in three dimensions and MR images of tissue in place of speckles.
@@ -20,18 +20,20 @@ from phantoms.motions import ShearStar
 RECOVERED = 0.9
 """Fraction of the amplitude that is recovered at the spatial resolution: a bias of 10 %."""
 
-_CENTRE_MM = np.array([400.0, 0.0, 0.0])  # far from the tendons of the heel, whose textures the block has
-_SHAPE, _SPACING_MM = (160, 56, 56), 0.8
+_CENTRE_MM = np.array([400.0, 0.0, 0.0])  # far from the tendons of the heel, whose textures the bar has
+_SHAPE, _SPACING_MM = (160, 72, 72), 0.8
 _AMPLITUDE_MM, _PERIODS_MM = 0.6, (4.0, 40.0)
-_FAR_MM, _FLAT_MM = 1e5, 2e4  # to bodies that are not in the block, and radius of the plane between its tissues
-_MARGIN_MM, _INTERFACE_MM = 8.0, 4.0  # from the faces of the block, and from the interface, that are not sampled
+_FAR_MM, _FLAT_MM = 1e5, 2e4  # to bodies that are not in the bar, and radius of the plane between its tissues
+_LONG_MM, _AIR_MM = 400.0, 4.0  # half of the bar's length; and air beside it
+_MARGIN_MM, _INTERFACE_MM = 8.0, 4.0  # from the ends of the image, and from the interface, that are not sampled
+_SAMPLED = 0.5  # of the image's width and height, about the axis of the bar
 _BINS = 24  # of the period
 _NOISE_STEP = 2  # voxels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarPair:
-    """Images of a block of tissue, half fat and half muscle: at rest, under a star of shear, and at rest again.
+    """Images of a bar of tissue, half fat and half muscle: at rest, under a star of shear, and at rest again.
 
     ``labels`` is on the grid of all three; ``star`` is the true motion from ``reference`` to ``loaded``, LPS mm.
     """
@@ -43,25 +45,30 @@ class StarPair:
     star: ShearStar
 
 
-def tissue_block(seed: int) -> Heel:
-    """A body of fat (z < 0) and muscle (z > 0) around (400, 0, 0) mm LPS, with the textures of a `Heel`."""
-    block = Heel(seed)
+def tissue_bar(seed: int, across_mm: tuple[float, float]) -> Heel:
+    """A round bar along x of fat (z < 0) and muscle (z > 0), with the textures of a `Heel`, in air.
+
+    It is centred at (400, 0, 0) mm LPS, with the semi-axes ``across_mm`` along y and z. A surface is needed: where
+    tissue fills an image, nothing holds it in the receive field, which differs from scan to scan.
+    """
+    bar = Heel(seed)
 
     def ball(centre: Sequence[float], radius: float) -> EllipsoidUnion:
         return EllipsoidUnion.of([(centre, (radius,) * 3, (0.0, 0.0, 0.0))])
 
+    outline = EllipsoidUnion.of([(_CENTRE_MM.tolist(), (_LONG_MM, *across_mm), (0.0, 0.0, 0.0))])
     around, away = ball(_CENTRE_MM.tolist(), _FAR_MM), ball((-_FAR_MM, 0.0, 0.0), 1.0)
     muscle = ball((float(_CENTRE_MM[0]), 0.0, _FLAT_MM), _FLAT_MM)
-    bodies = {"outline": around, "flesh": around, "bone": away, "ankle": away, "muscle": muscle}
+    bodies = {"outline": outline, "flesh": around, "bone": away, "ankle": away, "muscle": muscle}
     for name, body in bodies.items():
-        object.__setattr__(block, name, body)
-    return block
+        object.__setattr__(bar, name, body)
+    return bar
 
 
 def star_pair(
     seed: int = 1, shape: tuple[int, int, int] = _SHAPE, spacing_mm: float = _SPACING_MM, snr: float | None = 25.0
 ) -> StarPair:
-    """Images of a block of tissue under a star of shear along z, whose period grows along x from 4 to 40 mm.
+    """Images of a bar of tissue in air under a star of shear along z, whose period grows along x from 4 to 40 mm.
 
     InputError if the SNR is not positive.
     """
@@ -69,9 +76,11 @@ def star_pair(
     grid = Grid(shape, spacing, _CENTRE_MM - 0.5 * (np.array(shape) - 1) * spacing, np.eye(3))
     length = shape[0] * spacing_mm - 2.0 * _MARGIN_MM
     x, y = np.eye(3)[:2]
-    star, block = ShearStar(_CENTRE_MM, x, y, _AMPLITUDE_MM, *_PERIODS_MM, length), tissue_block(seed)
-    reference, repeat = (scan(block, grid, snr=snr, number=number) for number in (0, 2))
-    return StarPair(reference, scan(block, grid, star, snr=snr, number=1), repeat, labels_of(block, grid), star)
+    star = ShearStar(_CENTRE_MM, x, y, _AMPLITUDE_MM, *_PERIODS_MM, length)
+    wide, high = (0.5 * n * spacing_mm - _AIR_MM for n in shape[1:])
+    bar = tissue_bar(seed, (wide, high))
+    reference, repeat = (scan(bar, grid, snr=snr, number=number) for number in (0, 2))
+    return StarPair(reference, scan(bar, grid, star, snr=snr, number=1), repeat, labels_of(bar, grid), star)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +131,7 @@ def _depths(pair: StarPair) -> dict[str, FloatArray]:
     grid = pair.labels.grid
     extent = 0.5 * (grid.shape[2] - 1) * float(grid.spacing_mm[2])
     places = np.arange(-extent, extent + 1e-9, float(grid.spacing_mm[2]))
-    inner = places[(np.abs(places) < extent - _MARGIN_MM) & (np.abs(places) > _INTERFACE_MM)]
+    inner = places[(np.abs(places) < _SAMPLED * extent) & (np.abs(places) > _INTERFACE_MM)]
     return {"fat": inner[inner < 0.0], "muscle": inner[inner > 0.0]}
 
 
@@ -172,8 +181,8 @@ def efficiencies(measured: Deformation, still: Deformation, pair: StarPair) -> l
         found = [resolved_mm([r.period_mm for r in mine], [getattr(r, of) for r in mine]) for of in _QUANTITIES]
         grid = pair.labels.grid
         step = _NOISE_STEP * float(grid.spacing_mm.min())
-        reach = 0.5 * (np.array(grid.shape) - 1) * grid.spacing_mm - _MARGIN_MM
-        s, y = (np.arange(-reach[axis], reach[axis], step) for axis in (0, 1))
+        half = 0.5 * (np.array(grid.shape) - 1) * grid.spacing_mm
+        s, y = (np.arange(-reach, reach, step) for reach in (half[0] - _MARGIN_MM, _SAMPLED * half[1]))
         points = np.stack(np.meshgrid(s, y, depth[::_NOISE_STEP], indexing="ij"), axis=-1).reshape(-1, 3)
         axes = np.stack([star.along, star.normal, star.direction])
         u, H = still.evaluate(star.centre_mm + points @ axes)

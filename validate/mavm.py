@@ -58,7 +58,7 @@ def signed_areas(measured: FloatArray, simulated: FloatArray, volumes_ml: FloatA
     """d+ and d- between the distributions of two fields (n,) over the volumes (n,) of the same cells; exact.
 
     d+ = integral of max(F_simulated - F_measured, 0) over strain, and d- that of max(F_measured - F_simulated, 0), with
-    the cumulative distributions F by volume.
+    the cumulative distributions F by volume. InputError if a cell has no value.
 
     Examples
     --------
@@ -66,10 +66,12 @@ def signed_areas(measured: FloatArray, simulated: FloatArray, volumes_ml: FloatA
     >>> signed_areas(np.array([0.2, 0.5]), np.array([0.3, 0.3]), one)
     (0.1, 0.05)
     """
+    if missing := np.count_nonzero(~np.isfinite(measured + simulated)):
+        raise InputError(f"{missing} of {len(measured)} cells have no value in both fields; leave them out of both.")
     edges = np.unique(np.concatenate([measured, simulated]))
     larger = volume_above(measured, volumes_ml, edges[:-1]) - volume_above(simulated, volumes_ml, edges[:-1])
     parts = larger / volumes_ml.sum() * np.diff(edges)
-    return round(float(parts[parts > 0.0].sum()), 12), round(float(-parts[parts < 0.0].sum()), 12)
+    return round(float(np.maximum(parts, 0.0).sum()), 12), round(float(np.maximum(-parts, 0.0).sum()), 12)
 
 
 def model_form(

@@ -55,3 +55,13 @@ def test_few_experiments_widen_it_and_cells_do_not() -> None:
     assert (few.low, few.high) == pytest.approx((0.5, 0.5 + 2.9 * 0.1))
     with pytest.raises(InputError, match="at least two experiments"):
         safety_factor(1)
+
+
+def test_an_area_of_nothing_has_no_sign_and_a_field_that_is_not_known_is_refused() -> None:
+    """Zeros are written as 0. A cell without a value would count as no volume in one distribution, and not in all."""
+    for sides in (signed_areas(UNIFORM, UNIFORM, EQUAL), signed_areas(UNIFORM + 0.1, UNIFORM, EQUAL)):
+        assert np.copysign(1.0, sides).tolist() == [1.0, 1.0]
+    gaps = np.where(UNIFORM < 0.5, np.nan, UNIFORM)
+    for fields in ((gaps, UNIFORM), (UNIFORM, gaps)):
+        with pytest.raises(InputError, match="2000 of 4000 cells have no value"):
+            model_form(("m", "l", "t"), *fields, EQUAL)
