@@ -298,8 +298,9 @@ def _agreement(one: LoadComparison) -> tuple[Table, ...]:
     names, tissues = {"max_shear": "shear", "u_mm": "u, mm"}, (ALL, *one.fields.tissues)
     rows: list[tuple[Cell, ...]] = [(a.model, names[a.quantity], a.part, *_rounded(a, 6)) for a in one.agreements]
     by_distance = Table(
-        "Agreement by distance to bone", ("model", "quantity", "where", *_AGREED),
-        tuple(row for row in rows if row[2] not in tissues), "In all soft tissue, as above.",
+        "Agreement by distance to bone", ("model", "quantity", "from bone", *_AGREED),
+        tuple((*row[:2], str(row[2]).removesuffix(" from bone"), *row[3:]) for row in rows if row[2] not in tissues),
+        "In all soft tissue, as above.",
     )  # fmt: skip
     return (
         Table(

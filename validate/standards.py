@@ -98,7 +98,7 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
 
 def _accepted(of: Representation) -> str:
     functions = f"The measured strain in {of.tissue} was reconstructed from {of.coefficients} coefficients"
-    clusters = f"{of.clusters} clusters above three times the residual"
+    clusters = f"{of.clusters} cluster{'' if of.clusters == 1 else 's'} above three times the residual"
     figures = f"residual {of.u_rec:.3f}, measurement uncertainty {of.u_cal:.3f}, {clusters}"
     if of.accepted:
         return f"{functions}, as the guide asks ({figures})."
@@ -130,7 +130,7 @@ def _representations(one: LoadComparison) -> Table:
 def _model_forms(one: LoadComparison) -> Table:
     def cells(nothing: bool) -> tuple[tuple[Cell, ...], ...]:
         return tuple(
-            (m.model, m.tissue, m.measured_mean, m.mean, m.low, m.high, m.d_plus, m.d_minus)
+            (m.model, m.tissue, *(round(v, 4) for v in (m.measured_mean, m.mean, m.low, m.high, m.d_plus, m.d_minus)))
             for m in one.model_forms if (m.model == NOTHING) == nothing
         )  # fmt: skip
 
