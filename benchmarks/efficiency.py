@@ -16,6 +16,8 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+
 from benchmarks.registration_accuracy import elastix_default
 from dvc import Deformation, GaussNewton, GaussNewtonWithInterfaces, Image, Mask, Registration, Settings, register
 from dvc.registration.elastix import run as elastix
@@ -60,6 +62,11 @@ def measured(settings: Settings | None, pair: StarPair, threads: int) -> tuple[D
         return star.displacement, still.displacement, star.choice.as_dict()
 
 
+def _plain(row: dict[str, object]) -> dict[str, object]:
+    """A row for JSON, which knows no NaN: None stands for it."""
+    return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in row.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
@@ -77,6 +84,7 @@ def main() -> None:
         told = [asdict(e) | {"displacement_mm2": e.of_displacement_mm2, "strain_mm2": e.of_strain_mm2} for e in of]
         print(f"{engine}: {time.perf_counter() - began:.0f} s", *told, sep="\n  ", flush=True)
         recovered = [asdict(r) for r in star_rows(star, pair)]
+        told, recovered = ([_plain(row) for row in rows] for rows in (told, recovered))
         runs.append({"engine": engine, "choice": choice, "efficiency": told, "recovered": recovered})
         if given.out is not None:
             record = {"versions": versions(), "seed": given.seed, "snr": given.snr, "runs": runs}

@@ -12,6 +12,7 @@ from scipy.optimize import isotonic_regression
 
 from dvc import Deformation, Grid, Image, LabelMap, StrainField
 from dvc.arrays import FloatArray
+from dvc.errors import InputError
 from phantoms.anatomy import Heel
 from phantoms.bodies import EllipsoidUnion
 from phantoms.heel import labels_of, scan
@@ -70,8 +71,10 @@ def star_pair(
 ) -> StarPair:
     """Images of a bar of tissue in air under a star of shear along z, whose period grows along x from 4 to 40 mm.
 
-    InputError if the SNR is not positive.
+    InputError if the SNR is not positive, or the image is too small for the bar.
     """
+    if (least := 2.0 * (_AIR_MM + _INTERFACE_MM)) > spacing_mm * min(shape[1:]):
+        raise InputError(f"The image of a star must be at least {least:g} mm wide and high; give more voxels (shape).")
     spacing = np.full(3, spacing_mm)
     grid = Grid(shape, spacing, _CENTRE_MM - 0.5 * (np.array(shape) - 1) * spacing, np.eye(3))
     length = shape[0] * spacing_mm - 2.0 * _MARGIN_MM
@@ -115,7 +118,7 @@ def star_rows(measured: Deformation, pair: StarPair) -> list[StarRow]:
             strain -= side * _shear(H, star) / both
         edges = np.linspace(period.min(), period.max(), _BINS + 1)
         bins = np.clip(np.digitize(period, edges) - 1, 0, _BINS - 1)
-        for n in range(_BINS):
+        for n in np.unique(bins):
             here = bins == n
             rows.append(StarRow(tissue, *(float(np.nanmean(of[here])) for of in (period, u, strain))))
     return rows

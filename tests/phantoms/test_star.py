@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dvc import GaussNewton, Mask, Settings, register
 from dvc.arrays import FloatArray
+from dvc.errors import InputError
 from phantoms import ShearStar, StarPair, efficiencies, resolved_mm, star_pair, star_rows, tissue_bar
 
 SMALL = (60, 32, 48)
@@ -156,3 +157,12 @@ def test_two_scans_without_motion_are_registered_to_within_a_tenth_of_a_voxel() 
         assert abs(of.displacement_bias_mm) < 0.03
         assert 0.005 < of.displacement_noise_mm < 0.12
         assert 0.001 < of.strain_noise < 0.02
+
+
+def test_a_short_image_has_fewer_periods_and_a_narrow_one_is_refused() -> None:
+    pair = star_pair(shape=(30, 32, 48), spacing_mm=1.6)  # 20 voxels along the star, for up to 24 periods
+    rows = star_rows(pair.star, pair)
+    assert 20 <= len(rows) < 48
+    assert [row.displacement for row in rows] == pytest.approx([1.0] * len(rows))
+    with pytest.raises(InputError, match="at least 16 mm wide and high"):
+        star_pair(shape=(60, 8, 48), spacing_mm=1.6)
