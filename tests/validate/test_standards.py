@@ -57,7 +57,7 @@ def test_the_answer_comes_first_and_names_model_tissue_and_probability() -> None
         "coefficients); for a model without deformation it is 0%."
     )
     assert "as the guide asks (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
-    assert guide.startswith("CWA 16799 gives one uncertainty to all coefficients; with it right has 100%")
+    assert guide.startswith("CWA 16799 gives one uncertainty to all coefficients; with it, the probability is 100%")
     (alone,) = answer(compared(0.0, None))
     assert "no error model" in alone
     shown = section(one, None)
