@@ -31,7 +31,7 @@ from fe import LoadStep, NeoHooke, Plate, SolverOptions, Yeoh, cell_size_mm, pro
 from mrstrain.models.vary import COVERAGE, ORDER, SAFETY
 from mrstrain.records.provenance import versions
 from validate import ALL, ALL_LOADS, FeResult, LoadCase, Variant, compare_load, rank_over_loads
-from validate.ranking import _summed
+from validate.ranking import summed
 
 SPREAD = {"force": 0.03, "direction_deg": 2.0, "poisson": 0.5, "labels_mm": 0.4}
 LOADS = (LoadStep("Load1", 16.0), LoadStep("Load3", 6.0, 4.0))
@@ -232,7 +232,7 @@ def told(results, references) -> dict[str, object]:
     true = {(a.load, a.model, a.tissue): a.ml for one in references for a in one.areas}
     total = {a.model: a.ml for a in rank_over_loads(references).areas}
     bands = {(one.load, tissue): band for one in results for tissue, band in one.bands.items()}
-    bands[ALL_LOADS, ALL] = _summed([one.bands[ALL] for one in results], MODELS)
+    bands[ALL_LOADS, ALL] = summed([one.bands[ALL] for one in results], MODELS)
     true |= {(ALL_LOADS, name, ALL): ml for name, ml in total.items()}
     for (load, tissue), band in bands.items():
         exact = replace(band, varied_ml={})

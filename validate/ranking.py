@@ -59,7 +59,7 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     all loads. The normalised area is the mean over loads. Statements name loads whose verdict is Do not trust.
     """
     everywhere = [name for name in loads[0].fields.models if all(name in one.fields.models for one in loads)]
-    band = _summed([one.bands.get(ALL) for one in loads], [*everywhere, NOTHING])
+    band = summed([one.bands.get(ALL) for one in loads], [*everywhere, NOTHING])
     rows = []
     for name in (*everywhere, NOTHING):
         parts = [a for one in loads for a in one.areas if a.tissue == ALL and a.model == name]
@@ -88,7 +88,7 @@ def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
     return [a.model for a in areas if a.best_ml >= nothing.best_ml and not a.levelled]
 
 
-def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
+def summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
     """Areas to the drawn true fields, over all loads; None if the uncertainty of one is unknown.
 
     True fields are drawn for each load on its own; the inputs of models are the same under all loads in a draw.

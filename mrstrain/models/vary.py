@@ -70,7 +70,7 @@ def vary(
     coarse : path, optional
         Coarser mesh, in the coordinates of the image, on which everything is computed instead.
     voxel_mm : float
-        Edge of a voxel of the label map.
+        Edge of a voxel of the label map, or the cube root of its volume.
     tell : callable
         Called with the current step and the fraction of the whole that is done.
     """

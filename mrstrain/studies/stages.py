@@ -124,7 +124,7 @@ def vary(
     from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
     from mrstrain.options.uncertainty import Uncertainty
 
-    voxel_mm = float(read_labels(labels, names).grid.spacing_mm.min())
+    voxel_mm = float(read_labels(labels, names).grid.voxel_volume_mm3 ** (1 / 3))
     simulation, plate = _chosen(SimulationOptions, options), _chosen(PlateOptions, options)
     done = run(
         mesh, simulation=simulation, plate_options=plate, coordinates=_chosen(MeshCoordinates, options),
