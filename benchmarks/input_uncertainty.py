@@ -26,7 +26,8 @@ from pathlib import Path
 import numpy as np
 
 from dvc import Grid, LabelMap, TetMesh, plate_axes
-from dvc.trust.error_model import TruthDraws, error_model_of
+from dvc.trust.error_model import error_model_of
+from dvc.trust.truth_draws import TruthDraws
 from fe import LoadStep, NeoHooke, Plate, SolverOptions, Yeoh, cell_size_mm, problems_of, solve, variation
 from mrstrain.models.vary import COVERAGE, ORDER, SAFETY
 from mrstrain.records.provenance import versions

@@ -21,7 +21,9 @@ from scipy import sparse
 from dvc import StrainField
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.protocol import Motion
-from dvc.trust.error_model import TruthDraws, error_model_of, to_surface_mm
+from dvc.images.depth import to_surface_mm
+from dvc.trust.error_model import error_model_of
+from dvc.trust.truth_draws import TruthDraws
 from mrstrain.records.provenance import versions
 from phantoms import RIGID, Heel, heel_grid, labels_of, labels_to_mesh, pressed, under_load
 from validate import CellGraph, decompose, representation

@@ -20,7 +20,7 @@ import numpy as np
 
 from dvc import read_error_model, read_image, read_labels
 from dvc.atomic_files import write_json
-from dvc.trust.error_model import to_surface_mm
+from dvc.images.depth import to_surface_mm
 from mrstrain import phantom, register
 from mrstrain.records.provenance import versions
 from phantoms import RIGID

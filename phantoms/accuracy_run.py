@@ -3,7 +3,7 @@
 import json
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -26,10 +26,10 @@ from dvc import (
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.atomic_files import whole_file
 from dvc.deformation.protocol import Motion
+from dvc.images.depth import to_surface_mm
 from dvc.images.noise import signal_to_noise
 from dvc.images.resample import shows
 from dvc.own_files import read_arrays
-from dvc.trust.error_model import to_surface_mm
 from dvc.worker import Worker
 from phantoms.anatomy import Heel
 from phantoms.heel import (
@@ -47,7 +47,7 @@ from phantoms.motions import ShearWave
 RIGID = ("bone", "ankle")
 _STRIDE = 2  # neighbouring voxels are strongly correlated: one in eight is kept
 _LAGS = 8
-_FORMAT = 2
+_FORMAT = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class AccuracyCase:
         Fat's signal over the noise's standard deviation.
     motion : str
         "still" (registered as a repeat scan is), "smooth", "sliding", "swelling" (volume changes), "Load1" to "Load4",
-        or "wave-L" with a wavelength L in mm.
+        "attached-Load1", "attached-Load3" (strain is largest at bone), or "wave-L" with a wavelength L in mm.
     seed : int
         Of the heel, its images and the rigid motion of the foot.
     labels_off : int
@@ -122,13 +122,14 @@ class ErrorSamples:
         Maximum shear strain (E_1 - E_3) / 2, true and measured.
     u_error_mm : (n, 3)
         Measured minus true displacement of tissue relative to its bone, LPS mm.
-    mean_abs_strain : (n,)
-        Mean of the absolute values of the six components of the measured Green-Lagrange strain.
+    strain, strain_error : (n, 6)
+        Measured Green-Lagrange strain, and measured minus true: xx, xy, xz, yy, yz and zz in LPS axes.
     true_slope, slope : (n,)
         H_dn = d . (grad u) n of a shear wave, true and measured; zero for another motion.
-    correlation, lag_mm : (lags,)
-        Autocorrelation of the error of the maximum shear strain in soft tissue, and its distances: multiples of two
-        voxels' longest edge, along the axes that have it, mm.
+    correlation, lag_mm : (3, lags), (lags,)
+        Autocorrelation in soft tissue of the errors of the maximum shear strain, of the components of the strain and of
+        those of the displacement, and its distances: multiples of two voxels' longest edge, along the axes that have
+        it, mm.
     """
 
     case: AccuracyCase
@@ -142,7 +143,8 @@ class ErrorSamples:
     true_shear: Float32Array
     shear: Float32Array
     u_error_mm: Float32Array
-    mean_abs_strain: Float32Array
+    strain: Float32Array
+    strain_error: Float32Array
     true_slope: Float32Array
     slope: Float32Array
     correlation: FloatArray
@@ -252,10 +254,11 @@ def sampled_errors(
     known &= np.isfinite(true_H).all(axis=(1, 2))
     strain, true = StrainField.from_gradient(H), StrainField.from_gradient(true_H)
     d, n = (truth.direction, truth.normal) if isinstance(truth, ShearWave) else (np.zeros(3), np.zeros(3))
-    error = (strain.max_shear - true.max_shear).astype(np.float32)
-    correlation, lag_mm = _autocorrelation(error, known, sampled, labels)
+    components, u_error = _components(strain), u - true_u
+    component_errors = components - _components(true)
+    errors = (strain.max_shear - true.max_shear)[:, None], component_errors, u_error
+    correlation, lag_mm = _autocorrelation(errors, known, sampled, labels)
     to_bone, to_border = distances_mm(labels)
-    components = strain.green_lagrange[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
     def single(values: FloatArray) -> Float32Array:
         return np.asarray(values[known], dtype=np.float32)
@@ -265,11 +268,16 @@ def sampled_errors(
         seconds=registration.seconds, unknown=int(np.count_nonzero(~known)),
         folded=int(np.count_nonzero(strain.jacobian[known] <= 0)), tissue=labels.labels[sampled][known],
         to_bone_mm=to_bone[sampled][known], to_border_mm=to_border[sampled][known],
-        true_shear=single(true.max_shear), shear=single(strain.max_shear), u_error_mm=single(u - true_u),
-        mean_abs_strain=single(np.abs(components).mean(axis=1)),
+        true_shear=single(true.max_shear), shear=single(strain.max_shear), u_error_mm=single(u_error),
+        strain=single(components), strain_error=single(component_errors),
         true_slope=single(np.einsum("i,nij,j->n", d, true_H, n)), slope=single(np.einsum("i,nij,j->n", d, H, n)),
         correlation=correlation, lag_mm=lag_mm,
     )  # fmt: skip
+
+
+def _components(strain: StrainField) -> FloatArray:
+    """The six components of the Green-Lagrange strain: xx, xy, xz, yy, yz, zz, (n, 6)."""
+    return np.asarray(strain.green_lagrange[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
 
 
 def distances_mm(labels: LabelMap) -> tuple[Float32Array, Float32Array]:
@@ -290,17 +298,23 @@ def _rigid(labels: LabelMap) -> BoolArray:
 
 
 def _autocorrelation(
-    error: Float32Array, known: BoolArray, sampled: BoolArray, labels: LabelMap
+    errors: Sequence[FloatArray], known: BoolArray, sampled: BoolArray, labels: LabelMap
 ) -> tuple[FloatArray, FloatArray]:
-    """Autocorrelation of the error in soft tissue and its lags in mm, along the axes with the longest edge."""
-    field = np.full(labels.labels.shape, np.nan, dtype=np.float32)
-    field[sampled] = np.where(known, error, np.nan)
-    field[_rigid(labels)] = np.nan
-    field = field[::_STRIDE, ::_STRIDE, ::_STRIDE]
-    field -= np.nanmean(field)
-    variance = float(np.nanmean(field**2))
-    spacing = labels.grid.spacing_mm
-    along = [np.moveaxis(field, axis, 0) for axis in range(3) if spacing[axis] > spacing.max() - 1e-6]
-    lags = range(1, _LAGS + 1)
-    correlation = [float(np.mean([np.nanmean(f[lag:] * f[:-lag]) for f in along])) / variance for lag in lags]
-    return np.array(correlation), _STRIDE * float(spacing.max()) * np.array(lags, dtype=np.float64)
+    """Autocorrelation in soft tissue of each of the errors (n, components), and its lags in mm.
+
+    It is that along the axes with the longest edge, over all components of an error, (errors, lags).
+    """
+    spacing, soft = labels.grid.spacing_mm, ~_rigid(labels)[sampled] & known
+    axes = [axis for axis in range(3) if spacing[axis] > spacing.max() - 1e-6]
+    at, field = sampled.copy(), np.full(labels.labels.shape, np.nan, dtype=np.float32)
+    at[sampled] = soft
+    found = np.zeros((len(errors), _LAGS))
+    for number, error in enumerate(errors):
+        remaining = error[soft] - error[soft].mean(axis=0)
+        for component in remaining.T:
+            field[at] = component
+            every = field[::_STRIDE, ::_STRIDE, ::_STRIDE]
+            along = [np.moveaxis(every, axis, 0) for axis in axes]
+            found[number] += [np.mean([np.nanmean(f[lag:] * f[:-lag]) for f in along]) for lag in range(1, _LAGS + 1)]
+        found[number] /= np.mean(remaining**2, axis=0).sum()
+    return found, _STRIDE * float(spacing.max()) * np.arange(1.0, _LAGS + 1.0)

@@ -1,27 +1,26 @@
-"""The error model fitted to the runs of an accuracy study, and its coverage on heels that it was not fitted to."""
+"""The error model fitted to the runs of an accuracy study, and its coverage on motions that it was not fitted to."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from dvc import ErrorModel, ErrorTable
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import InputError
-from dvc.trust.error_model import POOLED, figures_of, widened
+from dvc.trust.components import NORMAL, SHEAR
+from dvc.trust.error_model import POOLED, SCALED
+from dvc.trust.uncertainty import figures_of, widened
 from phantoms.accuracy_run import ErrorSamples
+from phantoms.error_moments import BONE_MM, FEW, KNOTS, errors_by_cell
 from phantoms.error_tables import SOFT, OfCondition, by_condition, of_tissue
 
-_KNOTS = np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5])
-_EDGES = np.concatenate([[0.0], 0.5 * (_KNOTS[1:] + _KNOTS[:-1]), [np.inf]])
-_BONE_MM = np.array([0.0, 2.0, 4.0, 8.0])
-_PRIOR = 400.0  # samples that the prior of a cell counts for
-_FEW = 50.0
 _THRESHOLDS = (0.1, 0.3)
 _DRAWS = 8  # of each training run, when coverage of the intervals is evaluated
+_SOME = 20_000  # of a tissue's samples that figures are drawn of
+_PRIOR = 400.0  # voxels that the factor of all distances counts for
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,7 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
     plain = [r for r in runs if r.case.wavelength_mm is None]
     if len(presets) != 1 or not plain:
         raise InputError(f"An error model needs one preset, and motions other than waves; got {sorted(presets)}.")
-    tables = tuple(replace(_table(some), widening=_widening(_validations(some))) for _, some in by_condition(plain))
+    tables = tuple(_calibrated(some) for _, some in by_condition(plain))
     digest = hashlib.sha256(parameters.encode()).hexdigest()
     return ErrorModel(Path(presets.pop()).name, digest, tables, source)
 
@@ -74,49 +73,103 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
 def coverage_rows(runs: Sequence[ErrorSamples], model: ErrorModel | None = None) -> list[CoverageRow]:
     """Coverage of an error model on these runs.
 
-    By default by cross-validation: each heel is compared with a model fitted to all other heels. Motions are the same
-    in both, and conditions with a single heel have no rows.
+    By default by cross-validation: each kind of motion is compared with a model fitted to all other kinds, or each
+    heel with the others, where there is only one kind. Conditions with a single heel have no rows.
     """
     rows = []
     for condition, some in by_condition([r for r in runs if r.case.wavelength_mm is None]):
         if model is None:
             validations = _validations(some)
-            factor = _widening(validations)
+            table = replace(_table(some), scales=_scales(validations), widening=_widening(validations))
         else:
             table = model.table_for(np.array(some[0].case.spacing_mm), some[0].estimated_snr)
-            validations, factor = [_validated(run, tissue, table) for run, tissue in _large(some)], table.factor
-        for motion, tissue in dict.fromkeys((v.motion, v.tissue) for v in validations):
-            mine = [v for v in validations if (v.motion, v.tissue) == (motion, tissue)]
-            within = float(np.concatenate([v.within for v in mine]).mean())
+            as_drawn = replace(table, scales={})
+            validations = [_validated(run, tissue, as_drawn) for run, tissue in _large(some)]
+        for motion, tissue in dict.fromkeys((v.run.case.motion, v.tissue) for v in validations):
+            mine = [v for v in validations if (v.run.case.motion, v.tissue) == (motion, tissue)]
+            within = {name: float(np.mean(np.concatenate([v.within(name, table) for v in mine]))) for name in SCALED}
             remaining = float(np.concatenate([v.remaining for v in mine]).mean())
-            figures = float(np.mean([v.scores <= factor for v in mine]))
-            rows.append(CoverageRow(*condition, motion, tissue, within, remaining, figures))
+            figures = float(np.mean([v.scores <= table.factor for v in mine]))
+            rows.append(CoverageRow(*condition, motion, tissue, within["sd"], remaining, figures))
     return rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Validation:
-    """One tissue of one run, compared with a model of the other heels."""
+    """One tissue of one run, compared with a model of others."""
 
-    motion: str
+    run: ErrorSamples
     tissue: str
-    remaining: FloatArray  # errors minus their expected bias
-    within: BoolArray  # whether each of these is within 1.96 standard deviations
+    to_bone_mm: Float32Array
+    remaining: FloatArray  # errors of the maximum shear strain (n,) minus their expected bias
+    off: Mapping[str, FloatArray]  # size of the errors of `SCALED` in standard deviations (n, components), not scaled
     scores: FloatArray  # distance of the true figures from the draws' middle, in units of their interval on that side
+
+    def within(self, name: str, table: ErrorTable) -> BoolArray:
+        """Whether each error (n, components) is within 1.96 of a table's scaled standard deviations."""
+        return self.off[name] < 1.96 * table.scale(name, self.tissue, self.to_bone_mm)[:, None]
 
 
 def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:
     """Every tissue of runs of one condition; empty with a single heel."""
-    seeds = sorted({r.case.seed for r in runs})
-    if len(seeds) < 2:
+    if len({r.case.seed for r in runs}) < 2:
         return []
-    tables = {seed: _table([r for r in runs if r.case.seed != seed]) for seed in seeds}
-    return [_validated(run, tissue, tables[run.case.seed]) for run, tissue in _large(runs)]
+    several = len({r.case.kind for r in runs}) > 1
+    groups: dict[str | int, list[ErrorSamples]] = {}
+    for run in runs:
+        groups.setdefault(run.case.kind if several else run.case.seed, []).append(run)
+    return [
+        _validated(run, tissue, _table([r for other, some in groups.items() if other != group for r in some]))
+        for group, mine in groups.items()
+        for run, tissue in _large(mine)
+    ]
 
 
 def _large(runs: Sequence[ErrorSamples]) -> list[tuple[ErrorSamples, str]]:
     """The soft tissues of each run that have enough samples."""
-    return [(r, tissue) for r in runs for tissue in SOFT if np.count_nonzero(of_tissue(r.tissue, tissue)) >= _FEW]
+    return [(r, tissue) for r in runs for tissue in SOFT if np.count_nonzero(of_tissue(r.tissue, tissue)) >= FEW]
+
+
+def _calibrated(runs: Sequence[ErrorSamples]) -> ErrorTable:
+    """The table of runs of one condition, with scales and widening."""
+    validations = _validations(runs)
+    return replace(_table(runs), scales=_scales(validations), widening=_widening(validations))
+
+
+def _table(runs: Sequence[ErrorSamples]) -> ErrorTable:
+    """Errors of runs of one condition, for all runs together and for each run, by tissue; not calibrated."""
+    whole, each = errors_by_cell(runs)
+    snr = float(np.median([r.estimated_snr for r in runs]))
+    shear_mm, *component_mm = (_correlation_mm(runs, n) for n in range(3))
+    return ErrorTable(
+        np.array(runs[0].case.spacing_mm), snr, KNOTS, BONE_MM, whole, tuple(each), shear_mm,
+        component_correlation_mm=(component_mm[0], component_mm[1]),
+    )  # fmt: skip
+
+
+def _scales(validations: Sequence[_Validation]) -> dict[str, FloatArray]:
+    """Factors (4, k) by tissue on the standard deviations, by which they hold in every kind of motion."""
+    if not validations:
+        return {}
+    of = {tissue: [v for v in validations if v.tissue == tissue] for tissue in {v.tissue for v in validations}}
+    return {t: np.stack([_scale(some, n) for n in SCALED]) for t, some in {**of, POOLED: validations}.items()}
+
+
+def _scale(validations: Sequence[_Validation], name: str) -> FloatArray:
+    """Factor (k,) by distance to bone with which 95 % of the voxels of every kind lie within 1.96 deviations.
+
+    The factor of few voxels goes towards that of all distances.
+    """
+    factors = []
+    for kind in {v.run.case.kind for v in validations}:
+        mine = [v for v in validations if v.run.case.kind == kind]
+        off = np.concatenate([v.off[name] for v in mine])
+        bins = np.searchsorted(BONE_MM, np.concatenate([v.to_bone_mm for v in mine]), side="right") - 1
+        of_all = np.quantile(off, 0.95)
+        some = [off[bins == k] for k in range(len(BONE_MM))]
+        share = np.array([len(s) / (len(s) + _PRIOR) for s in some])
+        factors.append(share * [np.quantile(s, 0.95) if len(s) else of_all for s in some] + (1.0 - share) * of_all)
+    return np.asarray(np.max(factors, axis=0) / 1.96)
 
 
 def _widening(validations: Sequence[_Validation]) -> float:
@@ -129,87 +182,38 @@ def _widening(validations: Sequence[_Validation]) -> float:
 def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation:
     kept = of_tissue(run.tissue, tissue)
     shear, true = run.shear[kept].astype(np.float64), run.true_shear[kept].astype(np.float64)
-    bias, sd = table.expected(tissue, shear, run.to_bone_mm[kept])
+    at_mm = run.to_bone_mm[kept]
+    bias, sd = table.expected(tissue, shear, at_mm)
     remaining = shear - true - bias
-    random = np.random.default_rng(1)
-    draws = []
+    off = {"sd": np.abs(remaining / sd)[:, None]}
+    if table.has_components:
+        shrinkage, normal, sheared, displaced = table.expected_components(tissue, shear, at_mm)[:, :, None]
+        left = run.strain_error[kept] - shrinkage * run.strain[kept]
+        off |= {"sd_normal": np.abs(left[:, NORMAL] / normal), "sd_shear": np.abs(left[:, SHEAR] / sheared)}
+        off["sd_displacement_mm"] = np.abs(run.u_error_mm[kept] / displaced)
+    return _Validation(run, tissue, at_mm, remaining, off, _scores(shear, true, tissue, at_mm, table))
+
+
+def _scores(
+    shear: FloatArray, true: FloatArray, tissue: str, to_bone_mm: Float32Array, table: ErrorTable
+) -> FloatArray:
+    """Distance of the true figures of a tissue from the middle of figures drawn, in units of the interval there."""
+    random, few = np.random.default_rng(1), slice(None, None, -(-len(shear) // _SOME))
+    some, at_mm, draws = shear[few], to_bone_mm[few], []
     for number in range(len(table.runs)):
-        b, s = table.expected(tissue, shear, run.to_bone_mm[kept], number)
+        b, s = table.expected(tissue, some, at_mm, number)
         for _ in range(_DRAWS):
-            drawn = np.maximum(shear - b - s * random.standard_normal(len(b)), 0.0)
+            drawn = np.maximum(some - b - s * random.standard_normal(len(b)), 0.0)
             draws.append(figures_of(drawn, 1.0, _THRESHOLDS))
     low, middle, high = widened(np.array(draws), 1.0)
     off = figures_of(true, 1.0, _THRESHOLDS) - middle
     reach = np.where(off < 0, middle - low, high - middle)
-    scores = np.where(off == 0, 0.0, np.abs(off) / np.maximum(reach, 1e-9))
-    return _Validation(run.case.motion, tissue, remaining, np.abs(remaining) < 1.96 * sd, scores)
+    return np.where(off == 0, 0.0, np.abs(off) / np.maximum(reach, 1e-9))
 
 
-def _table(runs: Sequence[ErrorSamples]) -> ErrorTable:
-    """Errors of runs of one condition, for all runs together and for each run, by tissue."""
-    tissues = (*SOFT, POOLED)
-    pooled = _filled(_moments(runs, POOLED))
-    # The prior of a cell is its tissue's mean over all distances, whose own prior is that of all soft tissue.
-    priors = {tissue: _with_prior(_moments(runs, tissue), pooled) for tissue in SOFT} | {POOLED: pooled}
-    cells = {tissue: _by_distance(runs, tissue, priors[tissue][:, None]) for tissue in tissues}
-    return ErrorTable(
-        np.array(runs[0].case.spacing_mm),
-        float(np.median([r.estimated_snr for r in runs])),
-        _KNOTS,
-        _BONE_MM,
-        {tissue: _bias_and_sd(of_all) for tissue, of_all in cells.items()},
-        tuple({tissue: _bias_and_sd(_by_distance([r], tissue, cells[tissue])) for tissue in tissues} for r in runs),
-        _correlation_mm(runs),
-    )
-
-
-def _by_distance(runs: Sequence[ErrorSamples], tissue: str, prior: FloatArray) -> FloatArray:
-    """Moments (3, k, m) for each distance to bone, with a prior (3, 1 or k, m)."""
-    bins = pairwise([*_BONE_MM, np.inf])
-    return _with_prior(np.stack([_moments(runs, tissue, low, high) for low, high in bins], axis=1), prior)
-
-
-def _bias_and_sd(cells: FloatArray) -> FloatArray:
-    """Bias and standard deviation by distance to bone and measured shear, (2, k, m), from their moments (3, k, m)."""
-    _, mean, square = cells
-    return np.stack([mean, np.sqrt(np.maximum(square - mean**2, 1e-10))])
-
-
-def _moments(runs: Sequence[ErrorSamples], tissue: str, low: float = 0.0, high: float = np.inf) -> FloatArray:
-    """Number, mean and mean square of the errors by measured shear, (3, m), from ``low`` to ``high`` mm off bone.
-
-    Every sample has the same weight.
-    """
-    count, total, square = np.zeros((3, len(_KNOTS)))
-    for run in runs:
-        kept = of_tissue(run.tissue, tissue) & (run.to_bone_mm >= low) & (run.to_bone_mm < high)
-        cell = np.searchsorted(_EDGES, run.shear[kept], side="right") - 1
-        error = (run.shear - run.true_shear)[kept].astype(np.float64)
-        count += np.bincount(cell, minlength=len(_KNOTS))
-        total += np.bincount(cell, error, minlength=len(_KNOTS))
-        square += np.bincount(cell, error**2, minlength=len(_KNOTS))
-    some = np.maximum(count, 1.0)
-    return np.stack([count, total / some, square / some])
-
-
-def _filled(moments: FloatArray) -> FloatArray:
-    """Moments in which shears with few samples take those of the nearest with enough."""
-    often = np.flatnonzero(moments[0] >= _FEW)
-    if not len(often):
-        raise InputError(f"An error model needs at least {_FEW:.0f} samples of soft tissue.")
-    nearest = often[np.argmin(np.abs(_KNOTS[:, None] - _KNOTS[often]), axis=1)]
-    return np.stack([moments[0], *moments[1:, nearest]])
-
-
-def _with_prior(own: FloatArray, prior: FloatArray) -> FloatArray:
-    """Moments averaged with a prior that counts for 400 samples."""
-    weight = own[0] / (own[0] + _PRIOR)
-    return np.stack([own[0] + _PRIOR, *(weight * own[1:] + (1 - weight) * prior[1:])])
-
-
-def _correlation_mm(runs: Sequence[ErrorSamples]) -> float:
-    """Distance at which the mean autocorrelation of the error falls to 1/e, mm."""
-    values = np.concatenate([[1.0], np.mean([r.correlation for r in runs], axis=0)])
+def _correlation_mm(runs: Sequence[ErrorSamples], row: int) -> float:
+    """Distance at which the mean autocorrelation of an error falls to 1/e, mm."""
+    values = np.concatenate([[1.0], np.mean([r.correlation[row] for r in runs], axis=0)])
     lags = np.concatenate([[0.0], runs[0].lag_mm])
     below = np.flatnonzero(values < np.exp(-1.0))
     if not len(below):

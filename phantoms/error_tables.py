@@ -249,7 +249,7 @@ def floor_rows(runs: Sequence[ErrorSamples]) -> list[FloorRow]:
         for tissue in (*TISSUES.values(), POOLED) if still else ():
             kept = of_tissue(pool["tissue"], tissue)
             if kept.any():
-                strain = pool["mean_abs_strain"][kept]
+                strain = np.abs(pool["strain"][kept]).mean(axis=1)
                 p50, p95 = (float(p) for p in np.percentile(pool["shear"][kept], [50, 95]))
                 rows.append(FloorRow(*condition, tissue, float(strain.mean()), float(strain.std()), p50, p95))
     return rows

@@ -34,6 +34,7 @@ _PRESS_MM, _SHEAR_MM, _SLIDE = 7.5, 5.0, 0.1
 _WAVE_PEAK = 0.2
 _CENTRE_MM = np.array([0.0, 0.0, -6.0])
 _CONTACT_MM = (0.0, 15.0, -47.0)  # of the plate and the sole, at size 1
+_WHOLE_SOLE = (0.0, 14.0, -50.0), (51.0, 58.0, 31.0)  # window: centre and width, mm at size 1
 _MARGIN_MM = 4.0
 _FIELD_MM = (100.8, 112.0, 105.6)
 _FINEST_MM, _COARSEST_MM, _LARGEST = 0.3, 4.0, 512
@@ -211,8 +212,7 @@ def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
     Its bones are constrained. Both displacements are those of a heel of size 1 and scale with the heel.
     """
     steps = max(3, int(np.ceil(1.1 * np.hypot(press_mm, shear_mm))))
-    window = (0.0, 14.0, -50.0), (51.0, 58.0, 31.0)
-    return _flow(heel, (0.0, -shear_mm, press_mm), _CONTACT_MM, _around_bones(heel), window, steps=steps)
+    return _flow(heel, (0.0, -shear_mm, press_mm), _CONTACT_MM, _around_bones(heel), _WHOLE_SOLE, steps=steps)
 
 
 def _flow(heel: Heel, plate: _Triple, pivot: _Triple, rest: Border, window: _Window, **more: Any) -> Flow:
@@ -238,6 +238,17 @@ def sliding(heel: Heel, shear_mm: float) -> Flow:
     rest, skin = Border(heel.skeleton, ramp=0.6, order=2), Border(heel.flesh, ramp=0.2, order=2)
     steps = max(3, int(np.ceil(1.25 * shear_mm)))
     return _flow(heel, (0.0, _SLIDE * shear_mm, 0.0), pivot, rest, window, skin=skin, steps=steps)
+
+
+def attached(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
+    """Return the isochoric flow of tissue that is attached to bone, under a plate that moves as in `under_plate`.
+
+    Strain is largest at the surface of the bones, which do not move, and falls off over about 5 mm: the concentration
+    at bone of finite-element models of the heel. ``press_mm`` and ``shear_mm`` are those of a heel of size 1.
+    """
+    steps = max(5, int(np.ceil(1.6 * np.hypot(press_mm, shear_mm))))
+    plate, rest = (0.0, -shear_mm, press_mm), Border(heel.skeleton, ramp=0.6, order=2)
+    return _flow(heel, plate, _CONTACT_MM, rest, _WHOLE_SOLE, steps=steps)
 
 
 def swelling(heel: Heel) -> Flow:
@@ -268,6 +279,8 @@ _MOTIONS: Mapping[str, Callable[[Heel], Motion | None]] = {
     "sliding": partial(sliding, shear_mm=4.0),
     "swelling": swelling,
     **{load: partial(under_load, load=load) for load in LOADS},
+    "attached-Load1": partial(attached, press_mm=4.5, shear_mm=1.5),
+    "attached-Load3": partial(attached, press_mm=1.2, shear_mm=2.8),
 }
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from dvc.trust.error_model import widened
 from dvc.trust.regions import volume_above
+from dvc.trust.uncertainty import widened
 from validate.extrapolation import LEVELLED
 from validate.sensitivity import Sensitivity
 
@@ -183,11 +183,11 @@ def bands(
     Parameters
     ----------
     truths : iterable of (n,)
-        Maximum shear strain of each drawn true field, in the cells; see `dvc.trust.error_model.TruthDraws`.
+        Maximum shear strain of each drawn true field, in the cells; see `dvc.trust.truth_draws.TruthDraws`.
     models, tissues : mapping of name to (n,)
         Maximum shear strain of each model in the cells, and the cells of each tissue.
     narrowed : callable
-        Narrows a drawn true field (n,) to the spread of a perfect model: `dvc.trust.error_model.TruthDraws.narrowed`.
+        Narrows a drawn true field (n,) to the spread of a perfect model: `dvc.trust.truth_draws.TruthDraws.narrowed`.
     strains : (low, high)
         Range of the areas; the band begins at 0 and ends at one and a half times its upper end.
     sensitivities : mapping of name to Sensitivity, optional

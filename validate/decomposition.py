@@ -190,7 +190,7 @@ def decompose(
     u_cal : float
         Standard uncertainty of the measured field, root mean square over the tissue, in its unit.
     truths : (m, n)
-        True fields drawn from the measurement's error model; see `dvc.trust.error_model.TruthDraws`.
+        True fields drawn from the measurement's error model; see `dvc.trust.truth_draws.TruthDraws`.
     widening : float
         Factor on intervals of draws; see `dvc.trust.error_model.ErrorTable`.
 

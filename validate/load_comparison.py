@@ -14,7 +14,7 @@ from dvc.arguments import check, check_fields, checked
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.file_names import clash
-from dvc.trust.error_model import TruthDraws
+from dvc.trust.truth_draws import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from validate.comparison_error import ComparisonError, comparison_errors

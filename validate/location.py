@@ -18,7 +18,7 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import faces_of
 from dvc.tables import read_table
-from dvc.trust.error_model import widened
+from dvc.trust.uncertainty import widened
 
 LEAST_ML = 0.1
 """Default volume of the smallest cluster that counts, mL."""

@@ -1,10 +1,10 @@
-"""Depth below the border of a mask, finer than its voxels."""
+"""Distances from the border of a mask: of voxels' faces, or finer than its voxels."""
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.special import ndtri
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray
 
 _BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
 _SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
@@ -45,3 +45,26 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     depth[sure] = near_mm
     depth = gaussian_filter(depth, _EVEN, mode="nearest")
     return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))
+
+
+def to_surface_mm(body: BoolArray, spacing_mm: FloatArray) -> Float32Array:
+    """Distance (mm) of voxels' centres to the surface of a body of voxels: 0 inside it, infinite without one.
+
+    The surface lies half an edge from the centre of a voxel that touches it.
+    """
+    if not body.any():
+        return np.full(body.shape, np.inf, dtype=np.float32)
+    touching = np.full(body.shape, np.inf, dtype=np.float32)
+    for axis in range(body.ndim):
+        ahead, behind = [slice(None)] * body.ndim, [slice(None)] * body.ndim
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        differs = body[tuple(ahead)] != body[tuple(behind)]
+        half = np.where(differs, np.float32(0.5 * spacing_mm[axis]), np.float32(np.inf))
+        for side in (tuple(ahead), tuple(behind)):
+            np.minimum(touching[side], half, out=touching[side])
+    touching[body] = np.inf
+    at = np.isfinite(touching)
+    if not at.any():
+        return np.zeros(body.shape, dtype=np.float32)
+    distance, nearest = distance_transform_edt(~at, sampling=spacing_mm, return_indices=True)
+    return np.where(body, 0.0, distance + touching[tuple(nearest)]).astype(np.float32)

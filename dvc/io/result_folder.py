@@ -1,8 +1,7 @@
 """The results folder of one loaded image: the names of its files (given here only), their writers and readers."""
 
-import csv
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -10,7 +9,6 @@ from typing import Any, Self
 import numpy as np
 
 from dvc.arrays import Float32Array, FloatArray
-from dvc.atomic_files import write_csv
 from dvc.deformation.protocol import Deformation, RigidMotion, Within
 from dvc.deformation.strain import StrainField
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps
@@ -26,7 +24,7 @@ from dvc.io.transforms.interface_spline import FILE as INTERFACE_SPLINE
 from dvc.io.transforms.read import read_displacement, read_transform
 from dvc.io.transforms.write import ELASTIX_FILES
 from dvc.own_files import read_json
-from dvc.trust.error_model import ErrorModel, ErrorTable, Interval, Uncertainty, read_error_model
+from dvc.trust.error_model import ErrorTable, read_error_model
 from dvc.trust.verdict import Verdict
 
 DISPLACEMENT, DISPLACEMENT_NRRD = "displacement.nii.gz", "displacement.nrrd"
@@ -36,6 +34,9 @@ ALIGNED, REGISTERED = "aligned.nii.gz", "registered.nii.gz"
 SPLINE, SPLINE_WITH_BORDERS = ELASTIX_FILES[0], INTERFACE_SPLINE
 ITK_TRANSFORM = "transform.h5"
 SIGMA, INTERVALS, ERROR_MODEL = "sigma_max_shear.nii.gz", "intervals.csv", "error_model.json"
+SIGMA_NORMAL, SIGMA_SHEAR = "sigma_normal_strain.nii.gz", "sigma_shear_strain.nii.gz"
+SIGMA_DISPLACEMENT, COMPONENTS = "sigma_displacement.nii.gz", "components.csv"
+SOFT_TISSUES, TO_BONE = "soft_tissues.nii.gz", "distance_to_bone.nii.gz"
 REGIONS, QUALITY, PROVENANCE = "regions.csv", "quality.json", "provenance.json"
 ON_MESH, AT_NODES = "mesh.vtu", "nodal_displacements.csv"
 FIGURES, REPORT = "figures", "report.html"
@@ -167,33 +168,35 @@ def read_maps(folder: Path) -> StrainMaps:
     """Read what `write_maps` wrote; a file that is missing, damaged or on another grid is refused."""
     shear = read_scalar(folder / MAX_SHEAR)
     grid = shear.grid
-    jacobian, valid = read_scalar(folder / JACOBIAN, grid), read_mask(_there(folder / VALID))
+    jacobian, valid = read_scalar(folder / JACOBIAN, grid), read_mask(there(folder / VALID))
     displacement = _components(folder / DISPLACEMENT, grid, 3)
     tensor = _components(folder / GREEN_LAGRANGE, grid, len(TENSOR_COMPONENTS))
-    _same_grid(folder / VALID, valid.grid, grid)
+    same_grid(folder / VALID, valid.grid, grid)
     return StrainMaps(grid, valid.inside, displacement, tensor, shear.values, jacobian.values)
 
 
 def read_scalar(path: Path, grid: Grid | None = None) -> Image:
     """Read a map or an image of the folder, on the grid of the others; NaN where not defined."""
-    found, voxels = read_voxels(_there(path))
-    _same_grid(path, found, found if grid is None else grid)
+    found, voxels = read_voxels(there(path))
+    same_grid(path, found, found if grid is None else grid)
     return Image(found, np.ascontiguousarray(voxels, dtype=np.float32))
 
 
 def _components(path: Path, grid: Grid, count: int) -> Float32Array:
-    stored = read_nifti_header(_there(path), vectors=True, components=count)
-    _same_grid(path, stored.grid, grid)
+    stored = read_nifti_header(there(path), vectors=True, components=count)
+    same_grid(path, stored.grid, grid)
     return np.ascontiguousarray(stored.load(), dtype=np.float32)
 
 
-def _there(path: Path) -> Path:
+def there(path: Path) -> Path:
+    """A file of the folder; InputError where it is missing."""
     if not path.is_file():
         raise InputError(f"{path}: this file is missing from the results of a load. {AGAIN}")
     return path
 
 
-def _same_grid(path: Path, found: Grid, wanted: Grid) -> None:
+def same_grid(path: Path, found: Grid, wanted: Grid) -> None:
+    """Refuse a file on another grid than the other maps of its folder."""
     if not found.same_as(wanted):
         raise ImageFileError(f"{path}: on another grid than {MAX_SHEAR} in the same folder. {AGAIN}")
 
@@ -212,34 +215,6 @@ def in_axes(tensor: Float32Array, axes: FloatArray) -> Float32Array:
         full[..., i, j] = full[..., j, i] = tensor[..., c]
     turned = axes.T.astype(np.float32) @ full @ axes.astype(np.float32)
     return np.stack([turned[..., i, j] for i, j in _UPPER], axis=-1)
-
-
-def write_uncertainty(
-    folder: Path, grid: Grid, uncertainty: Uncertainty, model: ErrorModel | None, verdict: Verdict
-) -> None:
-    """Write the map of the standard deviation, the error model, and the intervals, each with the verdict."""
-    if model is not None:
-        model.write(folder / ERROR_MODEL)
-    write_image(folder / SIGMA, Image(grid, uncertainty.sigma))
-    rows = ((*astuple(row), verdict.words) for row in uncertainty.intervals)
-    write_csv(folder / INTERVALS, [*(f.name for f in fields(Interval)), "verdict"], rows)
-
-
-def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel] | None:
-    """Read what `write_uncertainty` wrote; None where the error was not known."""
-    if not (folder / ERROR_MODEL).is_file():
-        return None
-    model, sigma = read_error_model(folder / ERROR_MODEL), read_scalar(folder / SIGMA, grid)
-    path = _there(folder / INTERVALS)
-    names = [f.name for f in fields(Interval)]
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [[row[name] for name in names] for row in csv.DictReader(file)]
-        intervals = tuple(Interval(region, figure, *map(float, rest)) for region, figure, *rest in rows)
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as failure:
-        why = f"{type(failure).__name__}: {failure}"
-        raise InputError(f"{path}: not a table of intervals ({why}). {AGAIN}") from failure
-    return Uncertainty(sigma.values, intervals, model.tables[0]), model
 
 
 def write_mesh_results(

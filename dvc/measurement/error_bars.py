@@ -10,10 +10,14 @@ import numpy as np
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
+from dvc.images.depth import to_surface_mm
 from dvc.measurement.subject import Subject, is_bones_name
 from dvc.registration.register import Registration
-from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, Uncertainty, to_surface_mm, uncertainty_of
+from dvc.trust.components import components_of
+from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
+from dvc.trust.field_draws import FieldDraws
 from dvc.trust.twin_judgement import Judged, judged
+from dvc.trust.uncertainty import Uncertainty, uncertainty_of
 
 _MOSTLY = 0.5
 
@@ -43,6 +47,17 @@ class ErrorBars:
         """The error bars that `as_dict` gave, with their arrays."""
         twin = tuple(Judged(**row) for row in told.get("twin", ()))
         return cls(uncertainty, str(told.get("source", told.get("reason", ""))), model, twin, told.get("of_twin", ""))
+
+    def draws(self, maps: StrainMaps, seed: int) -> FieldDraws:
+        """Draws of the true fields of a measurement; InputError where its errors are not known."""
+        sure = self.uncertainty
+        if sure is None:
+            raise InputError(f"True fields cannot be drawn, because there are no error bars. {self.told}")
+        if sure.to_bone_mm is None:
+            raise InputError(
+                "True fields cannot be drawn from results of an older version. Register these images again."
+            )
+        return FieldDraws(maps, sure.regions, sure.to_bone_mm, sure.table, seed=seed, wider=_wider(self.twin))
 
     @property
     def summary(self) -> list[str]:
@@ -88,8 +103,9 @@ def error_bars(
         again = np.where(np.isfinite(maps.max_shear), twin.max_shear, np.float32(np.nan))
         of_twin = uncertainty_of(again, grid, regions, to_bone, table, seed=seed)
         rows = judged(maps.max_shear, again, regions, to_bone, of_twin, grid.voxel_volume_mm3)
-    wider = {row.region: row.factor for row in rows if row.factor is not None and row.factor > 1.0}
+    wider = _wider(rows)
     sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
+    sure = replace(sure, components=components_of(maps, regions, to_bone, table, wider))
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
     voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
     other = "" if own == voxel else f" (these images: voxels of {own} mm)"
@@ -99,6 +115,11 @@ def error_bars(
         f"soft tissue. {_held(table)} The model applies to tissue that is strained and imaged like these phantoms."
     )
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
+
+
+def _wider(rows: Sequence[Judged]) -> dict[str, float]:
+    """Factors on the error bars of tissues that did not hold in the twin."""
+    return {row.region: row.factor for row in rows if row.factor is not None and row.factor > 1.0}
 
 
 def _used(chosen: ErrorModel, table: ErrorTable, wider: Mapping[str, float]) -> ErrorModel:

@@ -1,6 +1,6 @@
 """A pair of images as it was measured: arrays, quality, verdict and error bars; written, read and shown."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from dvc.deformation.protocol import Deformation, RigidMotion, Within
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps, strain_maps
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, Mask
-from dvc.io import result_folder as files
+from dvc.io import error_files, result_folder as files
 from dvc.measurement import judgement, page
 from dvc.measurement.error_bars import NO_ERROR_BARS, ErrorBars, error_bars
 from dvc.measurement.judgement import Evidence, Source
@@ -28,9 +28,11 @@ from dvc.report.figures import Scale, coloured
 from dvc.report.page import Picture, Section, notebook_html
 from dvc.report.sheet import PLANES, Plane, View
 from dvc.trust.assessment import assess
-from dvc.trust.error_model import Interval
+from dvc.trust.components import ComponentUncertainty
+from dvc.trust.field_draws import TrueField
 from dvc.trust.quality import Quality, noise_floor
 from dvc.trust.regions import RegionRow, read_regions_csv, region_statistics, write_regions_csv
+from dvc.trust.uncertainty import Interval
 from dvc.trust.verdict import Verdict
 
 _SHOWN = "slices_meet_at_lps_mm"
@@ -182,7 +184,7 @@ class Measurement:
             what = f"damaged, or not written by `Measurement.write` ({failure!r})"
             raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
         maps = files.read_maps(place)
-        uncertainty, model = files.read_uncertainty(place, maps.grid) or (None, None)
+        uncertainty, model = error_files.read_uncertainty(place, maps.grid) or (None, None)
         if image is not None and not image.grid.same_as(maps.grid):
             what = f"The image is on another grid ({image.grid}) than the maps in {place} ({maps.grid})"
             raise GeometryError(f"{what}. Pass the unloaded image of that measurement.")
@@ -219,6 +221,40 @@ class Measurement:
         """95 % intervals of percentiles and volumes above a strain, by tissue; empty without error bars."""
         known = self.error_bars.uncertainty
         return () if known is None else known.intervals
+
+    def draws(self, count: int, *, seed: int = 1) -> Iterator[TrueField]:
+        """Draw true fields that agree with what was measured and with its errors, about 1 s each at 128^3 voxels.
+
+        Errors are alike in neighbouring voxels, and each draw errs as one registration of the accuracy study did, so
+        any figure computed from each of the fields has the uncertainty of its values over the draws.
+
+        Parameters
+        ----------
+        count : int
+            Number of draws, 1 or more.
+        seed : int
+            Of the random numbers.
+
+        Yields
+        ------
+        TrueField
+            Displacement, Green-Lagrange strain and maximum shear strain on the voxels of the soft tissues.
+
+        Raises
+        ------
+        InputError
+            Without error bars, or if the error model has no components.
+        """
+        if count < 1:
+            raise InputError(f"The number of draws must be 1 or more; got {count}.")
+        fields = self.error_bars.draws(self.maps, seed)
+        return (fields.drawn() for _ in range(count))
+
+    @property
+    def components(self) -> ComponentUncertainty | None:
+        """Standard uncertainty of the components of strain and displacement; None without error bars for them."""
+        known = self.error_bars.uncertainty
+        return None if known is None else known.components
 
     @property
     def bone_motion(self) -> RigidMotion:
@@ -366,7 +402,7 @@ class Measurement:
                 writing.append(pool.submit(judgement.write_images_and_transforms, partial, found, made.images))
             if bars.uncertainty is not None:
                 sure, grid = bars.uncertainty, self.maps.grid
-                writing.append(pool.submit(files.write_uncertainty, partial, grid, sure, bars.model, verdict))
+                writing.append(pool.submit(error_files.write_uncertainty, partial, grid, sure, bars.model, verdict))
             if (mesh := made.subject.mesh) is not None:  # in the same thread, as compiled kernels may not be in two
                 onto = pool.submit(files.write_mesh_results, partial, mesh, self.deformation, verdict)
             place = partial / files.FIGURES

@@ -16,9 +16,10 @@ from dvc.report import figures
 from dvc.report.drawing import Columns, Drawing
 from dvc.report.page import Cell, Table, shown
 from dvc.report.sheet import View
-from dvc.trust.error_model import Interval
+from dvc.trust.components import ComponentUncertainty
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
+from dvc.trust.uncertainty import Interval
 
 STRAIN = "Maximum shear strain"
 """Title of the picture of the strain."""
@@ -26,6 +27,11 @@ SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
 """Upper ends of the colours for maximum shear strain and its standard deviation."""
 FIXED_WEIGHTS = "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
 """In place of the table of weights, for a repeat scan."""
+_COMPONENTS = (
+    "Root mean square over the voxels of the tissue. It applies to u_x, u_y and u_z, to E_xx, E_yy and E_zz, and to "
+    "E_xy, E_xz and E_yz, in any axes; the expanded uncertainty (k = 2) is twice as large. components.csv also has the "
+    "means."
+)
 _TWIN = (
     "The unloaded image was warped by the measured displacement, fresh noise was added, and the pair was registered "
     "like the real one. Its true strain is the measured strain above, so the table shows the error that the noise and "
@@ -173,6 +179,8 @@ def error_tables(bars: ErrorBars) -> list[Table]:
         rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
         columns = ("region", "figure", "measured", "95 % interval from", "to")
         tables.append(Table("Maximum shear strain with 95 % intervals", columns, rows, bars.told))
+        if bars.uncertainty.components is not None:
+            tables.append(_component_table(bars.uncertainty.components))
     if bars.twin:
         claims = bars.uncertainty is not None
         claimed = ("voxels within the claimed error", "expected at least", "intervals widened, times")
@@ -181,6 +189,15 @@ def error_tables(bars: ErrorBars) -> list[Table]:
         lines = tuple((row.region, row.rms_error, row.bias, *more) for row, more in zip(bars.twin, beside, strict=True))
         tables.append(Table("Check by a synthetic warp of this pair (twin)", head, lines, _TWIN))
     return tables
+
+
+def _component_table(known: ComponentUncertainty) -> Table:
+    """The uncertainty of a component in one voxel, by tissue; the same along all axes."""
+    of = {(row.region, row.component): row.standard_uncertainty for row in known.rows}
+    columns = "region", "displacement, mm", "normal strain", "shear strain"
+    regions = dict.fromkeys(row.region for row in known.rows)
+    rows = [(name, of[name, "x"], of[name, "xx"], of[name, "xy"]) for name in regions]
+    return Table("Standard uncertainty of a component in one voxel", columns, tuple(rows), _COMPONENTS)
 
 
 def _words(figure: str) -> str:

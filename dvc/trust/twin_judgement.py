@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
-from dvc.trust.error_model import Uncertainty
+from dvc.trust.uncertainty import Uncertainty
 
 _SURE = 0.95
 _DEVIATIONS = 1.96

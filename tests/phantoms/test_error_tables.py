@@ -52,10 +52,11 @@ def samples(
         true_shear=true,
         shear=np.maximum(true + error, 0.0).astype(np.float32),
         u_error_mm=np.tile(np.array([0.3, 0.0, -0.4], dtype=np.float32), (count, 1)),
-        mean_abs_strain=np.full(count, 0.02, dtype=np.float32),
+        strain=np.full((count, 6), 0.02, dtype=np.float32),
+        strain_error=np.full((count, 6), 0.01, dtype=np.float32),
         true_slope=slope,
         slope=np.float32(0.8) * slope,
-        correlation=np.exp(-np.arange(1.0, 9.0) / 2.0),
+        correlation=np.tile(np.exp(-np.arange(1.0, 9.0) / 2.0), (3, 1)),
         lag_mm=1.6 * np.arange(1.0, 9.0),
     )
 

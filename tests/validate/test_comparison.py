@@ -14,7 +14,8 @@ from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
 from dvc.images.image import Grid, LabelMap
 from dvc.mesh import TetMesh
-from dvc.trust.error_model import POOLED, ErrorTable, TruthDraws
+from dvc.trust.error_model import POOLED, ErrorTable
+from dvc.trust.truth_draws import TruthDraws
 from tests.blocks import block
 from validate import (
     ALL,

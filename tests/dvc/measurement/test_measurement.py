@@ -36,8 +36,9 @@ ATTACK = "<script>alert('x')</script>"
 def measured(tiny_pair, worker) -> dvc.Measurement:
     """A pressed heel of 2.3 mm: with labels but one smooth spline, for speed, and by weights fixed beforehand."""
     settings = Settings.of("gauss-newton").of_repeat()
-    flat = np.full((2, 1, 2), 0.02)
-    table = ErrorTable(np.full(3, 2.3), 25.0, np.array([0.0, 0.5]), np.zeros(1), {POOLED: flat}, ({POOLED: flat},), 4.0)
+    flat = {POOLED: np.full((6, 1, 2), 0.02)}
+    lengths = {"correlation_mm": 4.0, "component_correlation_mm": (3.0, 5.0)}
+    table = ErrorTable(np.full(3, 2.3), 25.0, np.array([0.0, 0.5]), np.zeros(1), flat, (flat,), **lengths)
     digest = hashlib.sha256(settings.engine.text.encode()).hexdigest()
     with tasks_run_here():
         return dvc.measure(
@@ -103,6 +104,23 @@ def test_arrays_in_and_arrays_out(measured, tiny_pair):
     assert "maximum shear strain (E1 - E3)/2, median / 95th percentile: " in str(measured)
 
 
+def test_true_fields_can_be_drawn_also_from_a_folder(measured, written, stretched):
+    """The same draws of both, with the spread of the error bars where strain is known, and none without error bars."""
+    fields = list(measured.draws(20, seed=5))
+    again = next(dvc.Measurement.read(written).draws(1, seed=5))
+    for name in ("displacement_mm", "green_lagrange", "max_shear"):
+        np.testing.assert_allclose(getattr(again, name), getattr(fields[0], name), rtol=1e-5, atol=1e-6, err_msg=name)
+    soft = np.isfinite(measured.sigma)
+    assert (np.isfinite(fields[0].max_shear) == soft).all()
+    u = np.array([f.displacement_mm[soft] for f in fields])
+    assert u.std() == pytest.approx(np.std(measured.maps.displacement_mm[soft]), rel=0.1)
+    assert u.std(axis=0).mean() == pytest.approx(np.nanmean(measured.components.displacement_mm), rel=0.1)
+    with pytest.raises(InputError, match="1 or more"):
+        measured.draws(0)
+    with pytest.raises(InputError, match="no error bars"):
+        stretched.draws(1)
+
+
 def test_what_is_written_is_read_again(measured, written):
     again = dvc.Measurement.read(written)
     for name in ("valid", "displacement_mm", "green_lagrange", "max_shear", "jacobian"):
@@ -114,6 +132,11 @@ def test_what_is_written_is_read_again(measured, written):
         measured.quality.as_dict(),
     )
     np.testing.assert_array_equal(again.sigma, measured.sigma)
+    for name in ("normal_strain", "shear_strain", "displacement_mm"):
+        np.testing.assert_array_equal(getattr(again.components, name), getattr(measured.components, name), err_msg=name)
+    for one, other in zip(again.components.rows, measured.components.rows, strict=True):
+        assert (one.region, one.component, one.unit) == (other.region, other.component, other.unit)
+        assert list(asdict(one).values())[3:] == pytest.approx(list(asdict(other).values())[3:], rel=1e-5)
     for one, other in zip(again.intervals, measured.intervals, strict=True):
         assert (one.region, one.figure) == (other.region, other.figure)
         assert list(asdict(one).values())[2:] == pytest.approx(list(asdict(other).values())[2:], rel=1e-5)

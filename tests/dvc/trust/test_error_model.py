@@ -11,18 +11,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from dvc.errors import InputError
+from dvc.images.depth import to_surface_mm
 from dvc.images.image import Grid
-from dvc.trust.error_model import (
-    POOLED,
-    ErrorModel,
-    ErrorTable,
-    GaussianField,
-    TruthDraws,
-    figures_of,
-    read_error_model,
-    to_surface_mm,
-    uncertainty_of,
-)
+from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, read_error_model
+from dvc.trust.truth_draws import GaussianField, TruthDraws
+from dvc.trust.uncertainty import figures_of, uncertainty_of
 
 KNOTS = np.array([0.0, 0.1, 0.5])
 FAT = np.array([[[0.02, 0.0, -0.04], [0.01, 0.0, 0.0]], [[0.02, 0.02, 0.06], [0.01, 0.01, 0.01]]])
@@ -168,7 +161,7 @@ def test_no_more_than_a_few_truths_are_in_memory_at_once(monkeypatch: pytest.Mon
         return figures_of(shear, volume_ml)
 
     monkeypatch.setattr(TruthDraws, "drawn", counted)
-    monkeypatch.setattr("dvc.trust.error_model.figures_of", slow)
+    monkeypatch.setattr("dvc.trust.uncertainty.figures_of", slow)
     fat = np.zeros(GRID.shape, dtype=bool)
     fat[4:7, 4:7, 4:7] = True
     shear, far = np.full(GRID.shape, 0.2, dtype=np.float32), np.full(GRID.shape, 9.0, dtype=np.float32)

@@ -24,8 +24,9 @@ from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings
-from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, error_model_of, uncertainty_of
+from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, error_model_of
 from dvc.trust.twin_judgement import judged
+from dvc.trust.uncertainty import uncertainty_of
 from dvc.trust.verdict import Verdict
 
 GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))

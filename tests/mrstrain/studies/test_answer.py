@@ -9,8 +9,8 @@ import pytest
 
 from dvc.measurement.page import summary_table
 from dvc.report.page import Section, Table
-from dvc.trust.error_model import Interval
 from dvc.trust.regions import RegionRow
+from dvc.trust.uncertainty import Interval
 from mrstrain.studies.answer import answer_of
 from tests.validate.test_comparison import case, cube, labels, result, sheared
 from validate import Comparison, Criteria, compare

@@ -1,0 +1,97 @@
+"""The error bars of one load in its results folder: their writer and reader."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from dvc.atomic_files import write_csv
+from dvc.errors import InputError
+from dvc.images.image import Grid, Image, LabelMap
+from dvc.io.images.labels import read_labels
+from dvc.io.images.write import write_image, write_labels
+from dvc.io.result_folder import (
+    AGAIN,
+    COMPONENTS,
+    ERROR_MODEL,
+    INTERVALS,
+    SIGMA,
+    SIGMA_DISPLACEMENT,
+    SIGMA_NORMAL,
+    SIGMA_SHEAR,
+    SOFT_TISSUES,
+    TO_BONE,
+    read_scalar,
+    same_grid,
+    there,
+)
+from dvc.trust.components import ComponentRow, ComponentUncertainty
+from dvc.trust.error_model import ErrorModel, read_error_model
+from dvc.trust.uncertainty import Interval, Uncertainty
+from dvc.trust.verdict import Verdict
+
+_Row = TypeVar("_Row", bound=Interval | ComponentRow)
+
+
+def write_uncertainty(folder: Path, grid: Grid, sure: Uncertainty, model: ErrorModel | None, verdict: Verdict) -> None:
+    """Write maps of standard uncertainty, what they were read off (error model, tissues, distance), and the tables."""
+    if model is not None:
+        model.write(folder / ERROR_MODEL)
+    write_image(folder / SIGMA, Image(grid, sure.sigma))
+    _write_rows(folder / INTERVALS, Interval, sure.intervals, verdict)
+    if sure.to_bone_mm is not None and sure.regions:
+        numbers = np.zeros(grid.shape, dtype=np.int64)
+        for number, inside in enumerate(sure.regions.values(), start=1):
+            numbers[inside] = number
+        write_labels(folder / SOFT_TISSUES, LabelMap(grid, numbers, dict(enumerate(sure.regions, start=1))))
+        write_image(folder / TO_BONE, Image(grid, sure.to_bone_mm))
+    if (parts := sure.components) is not None:
+        maps = {SIGMA_NORMAL: parts.normal_strain, SIGMA_SHEAR: parts.shear_strain}
+        for name, sigma in (maps | {SIGMA_DISPLACEMENT: parts.displacement_mm}).items():
+            write_image(folder / name, Image(grid, sigma))
+        _write_rows(folder / COMPONENTS, ComponentRow, parts.rows, verdict)
+
+
+def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel] | None:
+    """Read what `write_uncertainty` wrote; None where the error was not known."""
+    if not (folder / ERROR_MODEL).is_file():
+        return None
+    model, sigma = read_error_model(folder / ERROR_MODEL), read_scalar(folder / SIGMA, grid)
+    intervals = _read_rows(folder / INTERVALS, Interval, 2)
+    sure = Uncertainty(sigma.values, intervals, model.tables[0])
+    if (folder / SOFT_TISSUES).is_file():
+        tissues = read_labels(folder / SOFT_TISSUES, there(folder / SOFT_TISSUES.replace(".nii.gz", ".csv")))
+        same_grid(folder / SOFT_TISSUES, tissues.grid, grid)
+        regions = {name: tissues.labels == number for number, name in tissues.names.items()}
+        to_bone = read_scalar(folder / TO_BONE, grid).values
+        sure = Uncertainty(sure.sigma, intervals, sure.table, regions, to_bone, _read_components(folder, grid))
+    return sure, model
+
+
+def _read_components(folder: Path, grid: Grid) -> ComponentUncertainty | None:
+    if not (folder / COMPONENTS).is_file():
+        return None
+    names = SIGMA_NORMAL, SIGMA_SHEAR, SIGMA_DISPLACEMENT
+    normal, shear, displacement_mm = (read_scalar(folder / name, grid).values for name in names)
+    rows = _read_rows(folder / COMPONENTS, ComponentRow, 3)
+    return ComponentUncertainty(normal, shear, displacement_mm, rows)
+
+
+def _write_rows(path: Path, kind: type[_Row], rows: Sequence[_Row], verdict: Verdict) -> None:
+    names = [f.name for f in fields(kind)]
+    write_csv(path, [*names, "verdict"], ([*(getattr(row, n) for n in names), verdict.words] for row in rows))
+
+
+def _read_rows(path: Path, kind: type[_Row], words: int) -> tuple[_Row, ...]:
+    """Rows of a table, in each of which some words come before the numbers."""
+    names = [f.name for f in fields(kind)]
+    try:
+        with there(path).open(newline="", encoding="utf-8") as file:
+            rows = [[row[name] for name in names] for row in csv.DictReader(file)]
+        return tuple(kind(*map(str, row[:words]), *map(float, row[words:])) for row in rows)  # type: ignore[arg-type]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as failure:
+        why = f"{type(failure).__name__}: {failure}"
+        raise InputError(f"{path}: not a table of intervals ({why}). {AGAIN}") from failure

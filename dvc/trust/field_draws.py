@@ -1,0 +1,120 @@
+"""True fields drawn for a measured displacement and strain by their error model."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.deformation.strain_maps import StrainMaps
+from dvc.errors import InputError
+from dvc.trust.components import NORMAL, SHEAR
+from dvc.trust.error_model import ROWS, SCALED, ErrorTable
+from dvc.trust.truth_draws import GaussianField
+
+_THREE, _TWO = np.sqrt(3.0), np.sqrt(2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueField:
+    """A drawn true field on the voxels of the unloaded image, reference configuration, LPS; NaN where not known.
+
+    Attributes
+    ----------
+    displacement_mm : (ni, nj, nk, 3)
+        Of tissue relative to its bone, mm.
+    green_lagrange : (ni, nj, nk, 6)
+        E_xx, E_xy, E_xz, E_yy, E_yz, E_zz.
+    max_shear : (ni, nj, nk)
+        Maximum shear strain (E_1 - E_3) / 2. Its error is drawn by its own figures, so it is not exactly that of
+        ``green_lagrange``.
+    """
+
+    displacement_mm: Float32Array
+    green_lagrange: Float32Array
+    max_shear: Float32Array
+
+
+class FieldDraws:
+    """Draws of the truth on a measurement's voxels: in each, one registration of the study errs as it did.
+
+    A value measured, less that registration's bias, less a Gaussian field of its standard deviation and of the error's
+    correlation length. Deviations, from the mean bias of all registrations too, are scaled as the table says.
+    Components of the strain err as an isotropic tensor does: a shear component with s, a normal one with n, and two
+    normal ones with the correlation 1 - 2 (s / n)^2, or -1/2 where that is less.
+
+    Parameters
+    ----------
+    maps : StrainMaps
+        Fields measured.
+    regions : mapping of (ni, nj, nk) bool
+        Soft tissues by name; nothing is drawn elsewhere.
+    to_bone_mm : (ni, nj, nk)
+        Distance to bone.
+    table : ErrorTable
+        With the errors of components; InputError without them.
+    wider : mapping, optional
+        Further factors on the deviations of some regions.
+    """
+
+    def __init__(
+        self, maps: StrainMaps, regions: Mapping[str, BoolArray], to_bone_mm: Float32Array, table: ErrorTable,
+        *, seed: int = 1, wider: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
+        if not table.has_components:
+            raise InputError(
+                "Draws need an error model with the errors of displacement and strain components, and this one is of "
+                "an older version. Make it again with `mrstrain accuracy`."
+            )
+        self._maps, self._table, self._wider = maps, table, wider
+        self._to_bone_mm, self._regions = to_bone_mm, {n: at & np.isfinite(maps.max_shear) for n, at in regions.items()}
+        self._random = np.random.default_rng(seed)
+        self._at = np.any(list(self._regions.values()), axis=0)
+        points = np.argwhere(self._at) * maps.grid.spacing_mm
+        lengths = (table.correlation_mm, *table.component_correlation_mm)
+        self._noise = [GaussianField(points, maps.grid.spacing_mm, length, self._random) for length in lengths]
+
+    def drawn(self) -> TrueField:
+        """Draw a true field."""
+        run = int(self._random.integers(len(self._table.runs)))
+        bias, sd, shrinkage, normal, sheared, displaced = self._errors(run)
+        noise_of_shear, noise_of_strain, noise_of_u = self._noise
+        maps, at = self._maps, self._at
+        shear = maps.max_shear[at] - bias - sd * noise_of_shear.drawn()
+        E, u = maps.green_lagrange[at], maps.displacement_mm[at]
+        E = E - shrinkage[:, None] * E - _isotropic(noise_of_strain, normal, sheared)
+        u = u - displaced[:, None] * np.stack([noise_of_u.drawn() for _ in range(3)], axis=1)
+        return TrueField(self._on_grid(u), self._on_grid(E), self._on_grid(np.maximum(shear, 0.0)))
+
+    def _errors(self, run: int) -> FloatArray:
+        """`ROWS` (6, n) of a registration of the study at the voxels, scaled about the mean over all registrations."""
+        table, maps = self._table, self._maps
+        found = np.empty((*self._at.shape, len(ROWS)), dtype=np.float32)
+        for name, where in self._regions.items():
+            at = name, maps.max_shear[where].astype(np.float64), self._to_bone_mm[where]
+            of_all, own = (np.stack([*table.expected(*at, r), *table.expected_components(*at, r)]) for r in (None, run))
+            wider = self._wider.get(name, 1.0)
+            sd, normal, sheared, displaced = (wider * table.scale(of, name, at[2]) for of in SCALED)
+            own[:2] = of_all[0] + sd * (own[0] - of_all[0]), sd * own[1]
+            own[2] = of_all[2] + normal * (own[2] - of_all[2])
+            own[3:] *= normal, sheared, displaced
+            found[where] = own.T
+        return np.asarray(found[self._at].T)
+
+    def _on_grid(self, values: FloatArray) -> Float32Array:
+        field = np.full((*self._at.shape, *values.shape[1:]), np.nan, dtype=np.float32)
+        field[self._at] = values
+        return field
+
+
+def _isotropic(field: GaussianField, normal: FloatArray, shear: FloatArray) -> FloatArray:
+    """Noise (n, 6) of a symmetric tensor whose statistics are the same in all axes, of the deviations (n,) given."""
+    drawn = np.empty((len(normal), 6))
+    for c in SHEAR:
+        drawn[:, c] = shear * field.drawn()
+    diagonal = np.stack([field.drawn() for _ in NORMAL], axis=1)
+    mean = diagonal.mean(axis=1)
+    volume = np.sqrt(np.maximum(normal**2 - 4.0 / 3.0 * shear**2, 0.0)) * _THREE * mean
+    drawn[:, NORMAL] = (_TWO * shear)[:, None] * (diagonal - mean[:, None]) + volume[:, None]
+    return drawn
