@@ -23,6 +23,7 @@ from .from_dvc import GeometryError, InputError, MrstrainError
 from .heel import (
     LOADS,
     HeelPair,
+    attached,
     centred_grid,
     covering,
     default_foot_motion,
@@ -50,7 +51,7 @@ __all__ = [
     "CoverageRow", "Efficiency", "EllipsoidUnion", "ErrorRow", "ErrorSamples", "FloorRow", "Flow",
     "GeometryError", "Heel", "HeelPair", "InputError", "MrstrainError", "ResolutionRow", "RunRow",
     "ShearStar", "ShearWave", "StarPair", "StarRow", "SyntheticWarp", "TissueError", "acquire",
-    "centred_grid", "compressed", "coverage_rows", "covering", "default_foot_motion", "distances_mm",
+    "attached", "centred_grid", "compressed", "coverage_rows", "covering", "default_foot_motion", "distances_mm",
     "efficiencies", "error_rows", "errors_by_tissue", "errors_of_maps", "figures", "fit_error_model",
     "floor_rows", "heel_grid", "heel_pair", "labels_of", "labels_to_mesh", "material_points", "measure_run",
     "misdrawn", "motion_named", "pressed", "random_foot_motion", "resolution_rows", "resolved_mm", "run_rows",

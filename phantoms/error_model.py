@@ -1,7 +1,7 @@
 """The error model fitted to the runs of an accuracy study, and its coverage on motions that it was not fitted to."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,6 @@ from dvc import ErrorModel, ErrorTable
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import InputError
 from dvc.trust.components import NORMAL, SHEAR
-from dvc.trust.error_model import POOLED, SCALED
 from dvc.trust.uncertainty import figures_of, widened
 from phantoms.accuracy_run import ErrorSamples
 from phantoms.error_moments import BONE_MM, FEW, KNOTS, errors_by_cell
@@ -20,12 +19,11 @@ from phantoms.error_tables import SOFT, OfCondition, by_condition, of_tissue
 _THRESHOLDS = (0.1, 0.3)
 _DRAWS = 8  # of each training run, when coverage of the intervals is evaluated
 _SOME = 20_000  # of a tissue's samples that figures are drawn of
-_PRIOR = 400.0  # voxels that the factor of all distances counts for
 
 
 @dataclass(frozen=True, slots=True)
 class CoverageRow(OfCondition):
-    """How often the truth lies where an error model fitted to the other heels predicts; the rest as in `ErrorRow`.
+    """How often the truth lies where an error model fitted to other motions predicts; the rest as in `ErrorRow`.
 
     Attributes
     ----------
@@ -37,6 +35,8 @@ class CoverageRow(OfCondition):
         Fraction of the tissue's figures (median, 90th and 95th percentile, volumes above 0.1 and 0.3) inside their
         intervals, over the runs; 0.95 over all motions and tissues by construction of the widening. The correlated
         field of the intervals is left out, because it averages out over a tissue.
+    normal_strain_within, shear_strain_within, displacement_within : float
+        As ``voxels_within``, of the components of the strain and of the displacement; NaN where the model has none.
     """
 
     motion: str
@@ -44,6 +44,9 @@ class CoverageRow(OfCondition):
     voxels_within: float
     left_over: float
     figures_within: float
+    normal_strain_within: float = float("nan")
+    shear_strain_within: float = float("nan")
+    displacement_within: float = float("nan")
 
 
 def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) -> ErrorModel:
@@ -65,7 +68,7 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
     plain = [r for r in runs if r.case.wavelength_mm is None]
     if len(presets) != 1 or not plain:
         raise InputError(f"An error model needs one preset, and motions other than waves; got {sorted(presets)}.")
-    tables = tuple(_calibrated(some) for _, some in by_condition(plain))
+    tables = tuple(replace(_table(some), widening=_widening(_validations(some))) for _, some in by_condition(plain))
     digest = hashlib.sha256(parameters.encode()).hexdigest()
     return ErrorModel(Path(presets.pop()).name, digest, tables, source)
 
@@ -73,24 +76,25 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
 def coverage_rows(runs: Sequence[ErrorSamples], model: ErrorModel | None = None) -> list[CoverageRow]:
     """Coverage of an error model on these runs.
 
-    By default by cross-validation: each kind of motion is compared with a model fitted to all other kinds, or each
-    heel with the others, where there is only one kind. Conditions with a single heel have no rows.
+    By default by cross-validation: each motion is compared with a model fitted to all other motions, or each heel with
+    the others, where there is only one motion. Conditions with a single run have no rows.
     """
     rows = []
     for condition, some in by_condition([r for r in runs if r.case.wavelength_mm is None]):
         if model is None:
             validations = _validations(some)
-            table = replace(_table(some), scales=_scales(validations), widening=_widening(validations))
+            factor = _widening(validations)
         else:
             table = model.table_for(np.array(some[0].case.spacing_mm), some[0].estimated_snr)
-            as_drawn = replace(table, scales={})
-            validations = [_validated(run, tissue, as_drawn) for run, tissue in _large(some)]
-        for motion, tissue in dict.fromkeys((v.run.case.motion, v.tissue) for v in validations):
-            mine = [v for v in validations if (v.run.case.motion, v.tissue) == (motion, tissue)]
-            within = {name: float(np.mean(np.concatenate([v.within(name, table) for v in mine]))) for name in SCALED}
+            validations, factor = [_validated(run, tissue, table) for run, tissue in _large(some)], table.factor
+        for motion, tissue in dict.fromkeys((v.motion, v.tissue) for v in validations):
+            mine = [v for v in validations if (v.motion, v.tissue) == (motion, tissue)]
+            within, *components = (
+                float(np.concatenate(some).mean()) for some in zip(*(v.within for v in mine), strict=True)
+            )
             remaining = float(np.concatenate([v.remaining for v in mine]).mean())
-            figures = float(np.mean([v.scores <= table.factor for v in mine]))
-            rows.append(CoverageRow(*condition, motion, tissue, within["sd"], remaining, figures))
+            figures = float(np.mean([v.scores <= factor for v in mine]))
+            rows.append(CoverageRow(*condition, motion, tissue, within, remaining, figures, *components))
     return rows
 
 
@@ -98,26 +102,21 @@ def coverage_rows(runs: Sequence[ErrorSamples], model: ErrorModel | None = None)
 class _Validation:
     """One tissue of one run, compared with a model of others."""
 
-    run: ErrorSamples
+    motion: str
     tissue: str
-    to_bone_mm: Float32Array
     remaining: FloatArray  # errors of the maximum shear strain (n,) minus their expected bias
-    off: Mapping[str, FloatArray]  # size of the errors of `SCALED` in standard deviations (n, components), not scaled
+    within: tuple[BoolArray, ...]  # whether the errors are within 1.96 standard deviations: of shear and of components
     scores: FloatArray  # distance of the true figures from the draws' middle, in units of their interval on that side
-
-    def within(self, name: str, table: ErrorTable) -> BoolArray:
-        """Whether each error (n, components) is within 1.96 of a table's scaled standard deviations."""
-        return self.off[name] < 1.96 * table.scale(name, self.tissue, self.to_bone_mm)[:, None]
 
 
 def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:
-    """Every tissue of runs of one condition; empty with a single heel."""
-    if len({r.case.seed for r in runs}) < 2:
-        return []
-    several = len({r.case.kind for r in runs}) > 1
+    """Every tissue of runs of one condition, each motion without those of its own; empty for a single run."""
+    several = len({r.case.motion for r in runs}) > 1
     groups: dict[str | int, list[ErrorSamples]] = {}
     for run in runs:
-        groups.setdefault(run.case.kind if several else run.case.seed, []).append(run)
+        groups.setdefault(run.case.motion if several else run.case.seed, []).append(run)
+    if len(groups) < 2:
+        return []
     return [
         _validated(run, tissue, _table([r for other, some in groups.items() if other != group for r in some]))
         for group, mine in groups.items()
@@ -130,12 +129,6 @@ def _large(runs: Sequence[ErrorSamples]) -> list[tuple[ErrorSamples, str]]:
     return [(r, tissue) for r in runs for tissue in SOFT if np.count_nonzero(of_tissue(r.tissue, tissue)) >= FEW]
 
 
-def _calibrated(runs: Sequence[ErrorSamples]) -> ErrorTable:
-    """The table of runs of one condition, with scales and widening."""
-    validations = _validations(runs)
-    return replace(_table(runs), scales=_scales(validations), widening=_widening(validations))
-
-
 def _table(runs: Sequence[ErrorSamples]) -> ErrorTable:
     """Errors of runs of one condition, for all runs together and for each run, by tissue; not calibrated."""
     whole, each = errors_by_cell(runs)
@@ -145,31 +138,6 @@ def _table(runs: Sequence[ErrorSamples]) -> ErrorTable:
         np.array(runs[0].case.spacing_mm), snr, KNOTS, BONE_MM, whole, tuple(each), shear_mm,
         component_correlation_mm=(component_mm[0], component_mm[1]),
     )  # fmt: skip
-
-
-def _scales(validations: Sequence[_Validation]) -> dict[str, FloatArray]:
-    """Factors (4, k) by tissue on the standard deviations, by which they hold in every kind of motion."""
-    if not validations:
-        return {}
-    of = {tissue: [v for v in validations if v.tissue == tissue] for tissue in {v.tissue for v in validations}}
-    return {t: np.stack([_scale(some, n) for n in SCALED]) for t, some in {**of, POOLED: validations}.items()}
-
-
-def _scale(validations: Sequence[_Validation], name: str) -> FloatArray:
-    """Factor (k,) by distance to bone with which 95 % of the voxels of every kind lie within 1.96 deviations.
-
-    The factor of few voxels goes towards that of all distances.
-    """
-    factors = []
-    for kind in {v.run.case.kind for v in validations}:
-        mine = [v for v in validations if v.run.case.kind == kind]
-        off = np.concatenate([v.off[name] for v in mine])
-        bins = np.searchsorted(BONE_MM, np.concatenate([v.to_bone_mm for v in mine]), side="right") - 1
-        of_all = np.quantile(off, 0.95)
-        some = [off[bins == k] for k in range(len(BONE_MM))]
-        share = np.array([len(s) / (len(s) + _PRIOR) for s in some])
-        factors.append(share * [np.quantile(s, 0.95) if len(s) else of_all for s in some] + (1.0 - share) * of_all)
-    return np.asarray(np.max(factors, axis=0) / 1.96)
 
 
 def _widening(validations: Sequence[_Validation]) -> float:
@@ -185,13 +153,13 @@ def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation
     at_mm = run.to_bone_mm[kept]
     bias, sd = table.expected(tissue, shear, at_mm)
     remaining = shear - true - bias
-    off = {"sd": np.abs(remaining / sd)[:, None]}
+    within = [np.abs(remaining) < 1.96 * sd]
     if table.has_components:
         shrinkage, normal, sheared, displaced = table.expected_components(tissue, shear, at_mm)[:, :, None]
-        left = run.strain_error[kept] - shrinkage * run.strain[kept]
-        off |= {"sd_normal": np.abs(left[:, NORMAL] / normal), "sd_shear": np.abs(left[:, SHEAR] / sheared)}
-        off["sd_displacement_mm"] = np.abs(run.u_error_mm[kept] / displaced)
-    return _Validation(run, tissue, at_mm, remaining, off, _scores(shear, true, tissue, at_mm, table))
+        left = np.abs(run.strain_error[kept] - shrinkage * run.strain[kept])
+        within += [left[:, NORMAL] < 1.96 * normal, left[:, SHEAR] < 1.96 * sheared]
+        within.append(np.abs(run.u_error_mm[kept]) < 1.96 * displaced)
+    return _Validation(run.case.motion, tissue, remaining, tuple(within), _scores(shear, true, tissue, at_mm, table))
 
 
 def _scores(

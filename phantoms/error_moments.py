@@ -21,13 +21,11 @@ _PRIOR = 400.0  # samples that the prior of a cell counts for
 def errors_by_cell(runs: Sequence[ErrorSamples]) -> tuple[dict[str, FloatArray], list[dict[str, FloatArray]]]:
     """Rows of an error table (`dvc.trust.error_model.ROWS`) over all runs, and in each of them, by tissue.
 
-    Every kind of motion has the same weight, and so has every run of a kind.
+    Every sample has the same weight.
     """
-    tissues, kinds = (*SOFT, POOLED), [r.case.kind for r in runs]
-    weights = np.array([1.0 / kinds.count(kind) for kind in kinds])
-    weights *= len(runs) / weights.sum()
+    tissues = *SOFT, POOLED
     each = {tissue: [_moments(run, tissue) for run in runs] for tissue in tissues}  # (rows, k + 1, m) of every run
-    of_all = {tissue: _mean(some, weights) for tissue, some in each.items()}
+    of_all = {tissue: _mean(some) for tissue, some in each.items()}
     pooled = _filled(of_all[POOLED][:, -1])
     # The prior of a cell is its tissue's mean over all distances, whose own prior is that of all soft tissue.
     priors = {tissue: _with_prior(of_all[tissue][:, -1], pooled) for tissue in SOFT} | {POOLED: pooled}
@@ -60,11 +58,11 @@ def _moments(run: ErrorSamples, tissue: str) -> FloatArray:
     return np.concatenate([sums[:1], sums[1:] / np.maximum(sums[0], 1.0)])
 
 
-def _mean(moments: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
+def _mean(moments: Sequence[FloatArray]) -> FloatArray:
     """Moments over several runs."""
-    count = np.array([w * m[0] for w, m in zip(weights, moments, strict=True)])
-    share = count / np.maximum(count.sum(axis=0), 1e-9)
-    return np.stack([count.sum(axis=0), *np.einsum("n...,nr...->r...", share, np.array([m[1:] for m in moments]))])
+    each = np.array(moments)
+    count = each[:, 0].sum(axis=0)
+    return np.stack([count, *(np.sum(each[:, 1:] * each[:, :1], axis=0) / np.maximum(count, 1.0))])
 
 
 def _filled(moments: FloatArray) -> FloatArray:

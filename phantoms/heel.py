@@ -246,7 +246,7 @@ def attached(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
     Strain is largest at the surface of the bones, which do not move, and falls off over about 5 mm: the concentration
     at bone of finite-element models of the heel. ``press_mm`` and ``shear_mm`` are those of a heel of size 1.
     """
-    steps = max(5, int(np.ceil(1.6 * np.hypot(press_mm, shear_mm))))
+    steps = max(6, int(np.ceil(1.8 * np.hypot(press_mm, shear_mm))))
     plate, rest = (0.0, -shear_mm, press_mm), Border(heel.skeleton, ramp=0.6, order=2)
     return _flow(heel, plate, _CONTACT_MM, rest, _WHOLE_SOLE, steps=steps)
 

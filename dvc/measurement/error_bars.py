@@ -147,10 +147,10 @@ def _of_twin(rows: Sequence[Judged], twin: TwinCheck | None) -> str:
 
 def _held(table: ErrorTable) -> str:
     if not np.isfinite(table.widening):
-        return "The coverage of these intervals is not known, because the study has only one heel."
+        return "The coverage of these intervals is not known, because the study has only one registration."
     return (
         f"Intervals are widened {table.widening:.1f} times, so that they contain 95 % of the true figures when each "
-        "heel of the study is compared with a model fitted to the others."
+        "part of the study is compared with a model fitted to the rest."
     )
 
 

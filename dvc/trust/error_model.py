@@ -9,14 +9,14 @@ that is strained and imaged like the study's phantoms, and for no other.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dvc.arrays import Float32Array, FloatArray, IntArray
+from dvc.arrays import Float32Array, FloatArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.own_files import read_json
@@ -30,11 +30,8 @@ ROWS = ("bias", "sd", "shrinkage", "sd_normal", "sd_shear", "sd_displacement_mm"
 as a fraction of it, and standard deviation about that of a normal and of a shear component; standard deviation of a
 component of the displacement, mm. The components' figures are the same in all axes."""
 
-SCALED = ("sd", "sd_normal", "sd_shear", "sd_displacement_mm")
-"""Standard deviations that a table may scale."""
-
 _FORMAT = 2
-_FORMER = 1  # without components and scales
+_FORMER = 1  # without components
 _FAR = 1.6  # a table is used for voxels and noise within this factor of its own
 
 
@@ -55,12 +52,9 @@ class ErrorTable:
     whole: Mapping[str, FloatArray]
     runs: tuple[Mapping[str, FloatArray], ...]
     correlation_mm: float  # distance at which the autocorrelation of the shear's error has fallen to 1/e
-    # Factor on intervals as drawn, by which 95 % of the tissues' figures lay in them when each kind of motion of the
-    # study was judged by the others; NaN where there was one heel alone, and intervals stay as drawn.
+    # Factor on intervals as drawn, by which 95 % of the tissues' figures lay in them when each motion of the study
+    # was judged by the others; NaN where there was one motion and one heel alone, and intervals stay as drawn.
     widening: float = float("nan")
-    # Factors on the standard deviations `SCALED` by tissue and distance to bone, (4, k), by which 95 % of the voxels of
-    # every kind of motion lay within 1.96 of them.
-    scales: Mapping[str, FloatArray] = field(default_factory=dict)
     # The same distance for the errors of a component of the strain and of the displacement.
     component_correlation_mm: tuple[float, float] = (float("nan"), float("nan"))
 
@@ -79,37 +73,23 @@ class ErrorTable:
     ) -> tuple[FloatArray, FloatArray]:
         """Bias and standard deviation (n,) of shears (n,) measured in a tissue at distances (n,) mm from bone.
 
-        Over all registrations, with the deviation scaled; or in the one numbered ``run``, as it is.
+        Over all registrations, or in the one numbered ``run``.
         """
         bias, sd = self._rows(tissue, shear, to_bone_mm, run, slice(2))
-        return bias, sd if run is not None else sd * self.scale("sd", tissue, to_bone_mm)
+        return bias, sd
 
     def expected_components(
         self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None = None
     ) -> FloatArray:
         """The rows (4, n) of `ROWS` on components of strain and displacement, as `expected`."""
-        rows = self._rows(tissue, shear, to_bone_mm, run, slice(2, None))
-        if run is None:
-            rows[1:] *= [self.scale(name, tissue, to_bone_mm) for name in SCALED[1:]]
-        return rows
-
-    def scale(self, name: str, tissue: str, to_bone_mm: Float32Array) -> FloatArray:
-        """Factor (n,) on the standard deviation ``name`` of `SCALED` in a tissue at distances (n,) mm from bone."""
-        if not self.scales:
-            return np.ones(len(to_bone_mm))
-        rows = self.scales[tissue if tissue in self.scales else POOLED]
-        return np.asarray(rows[SCALED.index(name)][self._bins(to_bone_mm)])
-
-    def _bins(self, to_bone_mm: Float32Array) -> IntArray:
-        bins = np.searchsorted(self.to_bone_mm, to_bone_mm, side="right") - 1
-        return np.asarray(np.clip(bins, 0, len(self.to_bone_mm) - 1))
+        return self._rows(tissue, shear, to_bone_mm, run, slice(2, None))
 
     def _rows(
         self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None, which: slice
     ) -> FloatArray:
         cells = self.whole if run is None else self.runs[run]
         rows = cells[tissue if tissue in cells else POOLED][which]
-        bins = self._bins(to_bone_mm)
+        bins = np.clip(np.searchsorted(self.to_bone_mm, to_bone_mm, side="right") - 1, 0, len(self.to_bone_mm) - 1)
         found = np.empty((len(rows), len(shear)))
         for k in range(len(self.to_bone_mm)):
             here = bins == k
@@ -159,7 +139,7 @@ class ErrorModel:
         tables = [
             {"spacing_mm": t.spacing_mm.tolist(), "snr": t.snr, "shear": t.shear.tolist()}
             | {"to_bone_mm": t.to_bone_mm.tolist(), "errors": rounded(t.whole)}
-            | {"errors_of_each_run": [rounded(run) for run in t.runs], "scales": rounded(t.scales)}
+            | {"errors_of_each_run": [rounded(run) for run in t.runs]}
             | {"correlation_mm": t.correlation_mm, "widening": plain(t.widening)}
             | {"component_correlation_mm": [plain(length) for length in t.component_correlation_mm]}
             for t in self.tables
@@ -200,7 +180,6 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
             runs=tuple(cells(run) for run in t[f"{name}_of_each_run"]),
             correlation_mm=float(t["correlation_mm"]),
             widening=number(t["widening"]),
-            scales=cells(t.get("scales", {})),
             component_correlation_mm=(number(lengths[0]), number(lengths[1])),
             **{name: np.asarray(t[name], dtype=np.float64) for name in ("spacing_mm", "shear", "to_bone_mm")},
         )
@@ -218,10 +197,8 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
         )
         if not (t.runs and all(sound)):
             raise ValueError(f"a table has no runs, or its figures are not {shape} finite numbers")
-        if not all(of.shape == (len(SCALED), shape[1]) and (of > 0).all() for of in t.scales.values()):
-            raise ValueError(f"its scales are not {len(SCALED), shape[1]} positive numbers")
-        if (t.scales and POOLED not in t.scales) or (t.has_components and not min(t.component_correlation_mm) > 0):
-            raise ValueError(f"it has no scales of '{POOLED}', or no correlation length of the components")
+        if t.has_components and not min(t.component_correlation_mm) > 0:
+            raise ValueError("it has no correlation length of the components")
         rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
         if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
             raise ValueError("a voxel size, SNR or bin is not positive, or the bins do not increase")

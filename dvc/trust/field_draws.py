@@ -10,7 +10,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
 from dvc.trust.components import NORMAL, SHEAR
-from dvc.trust.error_model import ROWS, SCALED, ErrorTable
+from dvc.trust.error_model import ROWS, ErrorTable
 from dvc.trust.truth_draws import GaussianField
 
 _THREE, _TWO = np.sqrt(3.0), np.sqrt(2.0)
@@ -40,9 +40,8 @@ class FieldDraws:
     """Draws of the truth on a measurement's voxels: in each, one registration of the study errs as it did.
 
     A value measured, less that registration's bias, less a Gaussian field of its standard deviation and of the error's
-    correlation length. Deviations, from the mean bias of all registrations too, are scaled as the table says.
-    Components of the strain err as an isotropic tensor does: a shear component with s, a normal one with n, and two
-    normal ones with the correlation 1 - 2 (s / n)^2, or -1/2 where that is less.
+    correlation length. Components of the strain err as an isotropic tensor does: a shear component with s, a normal one
+    with n, and two normal ones with the correlation 1 - 2 (s / n)^2, or -1/2 where that is less.
 
     Parameters
     ----------
@@ -88,18 +87,15 @@ class FieldDraws:
         return TrueField(self._on_grid(u), self._on_grid(E), self._on_grid(np.maximum(shear, 0.0)))
 
     def _errors(self, run: int) -> FloatArray:
-        """`ROWS` (6, n) of a registration of the study at the voxels, scaled about the mean over all registrations."""
+        """`ROWS` (6, n) of a registration of the study at the voxels."""
         table, maps = self._table, self._maps
         found = np.empty((*self._at.shape, len(ROWS)), dtype=np.float32)
         for name, where in self._regions.items():
-            at = name, maps.max_shear[where].astype(np.float64), self._to_bone_mm[where]
-            of_all, own = (np.stack([*table.expected(*at, r), *table.expected_components(*at, r)]) for r in (None, run))
+            at = name, maps.max_shear[where].astype(np.float64), self._to_bone_mm[where], run
+            bias, sd = table.expected(*at)
+            shrinkage, *deviations = table.expected_components(*at)
             wider = self._wider.get(name, 1.0)
-            sd, normal, sheared, displaced = (wider * table.scale(of, name, at[2]) for of in SCALED)
-            own[:2] = of_all[0] + sd * (own[0] - of_all[0]), sd * own[1]
-            own[2] = of_all[2] + normal * (own[2] - of_all[2])
-            own[3:] *= normal, sheared, displaced
-            found[where] = own.T
+            found[where] = np.stack([bias, wider * sd, shrinkage, *(wider * d for d in deviations)], axis=-1)
         return np.asarray(found[self._at].T)
 
     def _on_grid(self, values: FloatArray) -> Float32Array:

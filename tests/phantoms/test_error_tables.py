@@ -182,6 +182,51 @@ def test_coverage_judges_each_heel_by_the_others() -> None:
     assert coverage_rows(alike[:1]) == []
 
 
+def test_intervals_hold_for_a_motion_that_was_left_out() -> None:
+    """Heels err alike and motions do not: what is left out is the motion, so that intervals hold in others."""
+    offsets = {"Load1": 0.0, "smooth": 0.02, "sliding": -0.02, "attached-Load1": 0.01, "attached-Load3": -0.01}
+    runs = [
+        samples(replace(CASE, motion=motion, seed=seed), sd=0.01, count=20_000, offset=offset)
+        for motion, offset in offsets.items()
+        for seed in (1, 2)
+    ]
+    (table,) = fit_error_model(runs, "", "").tables
+    by_heel = [replace(run, case=replace(run.case, motion="Load1")) for run in runs]
+    assert table.widening > 1.3 * fit_error_model(by_heel, "", "").tables[0].widening
+    new = [samples(replace(CASE, motion="other", seed=9), sd=0.01, count=20_000, offset=o) for o in (0.025, -0.025)]
+    (row,) = (r for r in coverage_rows(new, fit_error_model(runs, "", "")) if r.tissue == "fat")
+    assert row.figures_within == 1.0
+    as_drawn = fit_error_model(runs, "", "")
+    as_drawn = replace(as_drawn, tables=(replace(table, widening=1.0),))
+    assert next(r for r in coverage_rows(new, as_drawn) if r.tissue == "fat").figures_within < 0.5
+
+
+def test_components_err_as_the_samples_do() -> None:
+    """A strain measured a tenth too small, noise of two sizes about that, and of a third in the displacement."""
+    random = np.random.default_rng(3)
+    runs = []
+    for seed in (1, 2):
+        run = samples(replace(CASE, seed=seed), count=30_000)
+        true = 0.2 * random.standard_normal((30_000, 6))
+        noise = random.standard_normal((30_000, 6)) * np.array([0.03, 0.02, 0.02, 0.03, 0.02, 0.03])
+        strain, u = 0.9 * true + noise, 0.4 * random.standard_normal((30_000, 3))
+        runs.append(replace(run, strain=strain, strain_error=strain - true, u_error_mm=u))
+    (table,) = fit_error_model(runs, "", "").tables
+    found = table.expected_components("fat", np.array([0.2]), np.array([9.0], dtype=np.float32))[:, 0]
+    # The mean error as a fraction of the measured strain, over the whole tensor, in which a shear component is twice.
+    counts = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
+    measured, error = np.concatenate([r.strain for r in runs]), np.concatenate([r.strain_error for r in runs])
+    slope = (counts * measured * error).sum() / (counts * measured**2).sum()
+    assert slope == pytest.approx(-0.1, abs=0.02)
+    left = error - slope * measured
+    sizes = np.sqrt(np.mean(left**2, axis=0))
+    np.testing.assert_allclose(found, [slope, sizes[0], sizes[1], 0.4], rtol=0.05, atol=0.003)
+    assert table.component_correlation_mm == pytest.approx((3.2, 3.2), abs=0.02)
+    row = next(r for r in coverage_rows(runs) if r.tissue == "fat")
+    within = row.normal_strain_within, row.shear_strain_within, row.displacement_within
+    np.testing.assert_allclose(within, 0.95, atol=0.01)
+
+
 def test_coverage_of_a_given_error_model() -> None:
     seen = [samples(replace(CASE, seed=s), sd=0.02, count=20_000) for s in (1, 2, 3)]
     model, new = fit_error_model(seen, "", ""), replace(CASE, seed=4)

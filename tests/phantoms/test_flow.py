@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from dvc.deformation.protocol import Composed, Motion
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from phantoms import LOADS, Border, EllipsoidUnion, Flow, Heel, pressed, sliding, swelling, under_load
+from phantoms import LOADS, Border, EllipsoidUnion, Flow, Heel, attached, pressed, sliding, swelling, under_load
 
 
 def test_flow_is_a_deformation(heel: Heel) -> None:
@@ -20,14 +20,15 @@ def test_flow_is_a_deformation(heel: Heel) -> None:
 
 def motions(heel: Heel) -> dict[str, Motion]:
     loads = {name: under_load(heel, name) for name in LOADS}
-    return {"pressed": pressed(heel), "pressed lightly": pressed(heel, 0.3), "sliding": sliding(heel, 4.0)} | loads
+    others = {"sliding": sliding(heel, 4.0), "attached": attached(heel, press_mm=4.5, shear_mm=1.5)}
+    return {"pressed": pressed(heel), "pressed lightly": pressed(heel, 0.3), **others} | loads
 
 
 def those_and_swelling(heel: Heel) -> dict[str, Motion]:
     return motions(heel) | {"swelling": swelling(heel)}
 
 
-MOTIONS = ["pressed", "pressed lightly", "sliding", *LOADS]
+MOTIONS = ["pressed", "pressed lightly", "sliding", "attached", *LOADS]
 
 
 @pytest.mark.parametrize("name", [*MOTIONS, "swelling"])
@@ -132,6 +133,20 @@ def test_strain_jumps_at_bone_and_skin_and_displacement_does_not(heel: Heel) -> 
         assert shear[1] == 0.0
         assert np.abs(u[0]).max() < 0.04  # 0.02 mm from the border
         assert not u[1].any()
+
+
+def test_strain_of_attached_tissue_is_largest_at_bone(heel: Heel) -> None:
+    """As in finite-element models of the heel, and not in the smooth load, whose strain vanishes there."""
+    points = np.random.default_rng(2).uniform([-30, -20, -48], [30, 46, 0], (60_000, 3))
+    points = points[heel.tissue_at(points) == 2]
+    away = heel.skeleton.distance(points)
+    for motion, largest in ((attached(heel, press_mm=4.5, shear_mm=1.5), True), (pressed(heel), False)):
+        shear = StrainField.from_gradient(motion.evaluate(points)[1]).max_shear
+        by_distance = [
+            np.percentile(shear[(away > a) & (away < b)], 95) for a, b in ((0.0, 1.0), (3.0, 5.0), (8.0, 20.0))
+        ]
+        assert (by_distance == sorted(by_distance, reverse=True)) == largest
+        assert (by_distance[0] > 0.3) == largest
 
 
 def test_smooth_border_has_no_jump(heel: Heel) -> None:
