@@ -199,10 +199,16 @@ def held(runs: list[ErrorSamples], model: ErrorModel) -> dict[str, dict[str, flo
             rows.setdefault(f"{tissue}, half width", []).append(1.96 * sd)
             rows.setdefault("near bone", []).append(within[one.to_bone_mm[of] < NEAR_MM])
     shares = {kind: {t: round(float(np.concatenate(w).mean()), 3) for t, w in of.items()} for kind, of in found.items()}
+    each: dict[tuple[str, str], list[float]] = {}
     for row in coverage_rows(runs, model):
         case = AccuracyCase("", VOXEL_MM, SNR, row.motion, 0)
         kind = f"{case.kind}{' at 1.2 mm' if row.voxel_mm == '1.2' else ''}"
-        shares[kind].setdefault(f"{row.tissue}, figures", row.figures_within)
+        of_row = {"figures": row.figures_within, "normal strain": row.normal_strain_within}
+        of_row |= {"shear strain": row.shear_strain_within, "displacement": row.displacement_within}
+        for what, share in of_row.items():
+            each.setdefault((kind, f"{row.tissue}, {what}"), []).append(share)
+    for (kind, name), some in each.items():
+        shares[kind][name] = round(float(np.mean(some)), 3)
     means = {t: round(float(np.mean([of[t] for of in shares.values()])), 3) for t in next(iter(shares.values()))}
     return {"every kind": means} | shares
 

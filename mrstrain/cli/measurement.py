@@ -143,7 +143,10 @@ def accuracy(
     snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio. Repeat for several.")] = None,
     motion: Annotated[
         list[str] | None,
-        typer.Option(help="still, smooth, sliding, swelling, Load1 to Load4, or wave-L (L in mm). Repeat for several."),
+        typer.Option(
+            help="still, smooth, sliding, swelling, attached-Load1, attached-Load3, Load1 to Load4, or wave-L (L in "
+            "mm). Repeat for several."
+        ),
     ] = None,
     seed: Annotated[
         list[int] | None,
@@ -156,7 +159,7 @@ def accuracy(
 ) -> None:
     """Measure the error of an engine or preset on phantoms: by tissue, position and strain; noise floor; resolution.
 
-    An interrupted study resumes. Default: 110 registrations with gauss-newton, seven motions and eight waves; voxels
+    An interrupted study resumes. Default: 130 registrations with gauss-newton, nine motions and eight waves; voxels
     of 0.8 mm at SNR 25, 12 and 50, and of 1.2 mm and 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr, only the
     conditions given are measured; the other of the two is then 0.8 mm or 25.
     """

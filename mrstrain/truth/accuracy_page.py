@@ -46,8 +46,9 @@ HOW_TO_READ = Section(
         "one in eight of the heel's voxels.",
         "Motions: still (rigid foot motion only), smooth (a smooth flow), sliding (the fat pad slides between "
         "constrained bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as "
-        "strong as under the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength "
-        "L mm). Labels +1 or -1: bones and skin are one voxel too large, or too small, in the label map that the "
+        "strong as under the forces of the published experiment), attached-Load1 and attached-Load3 (tissue attached "
+        "to bone, where its strain is largest), wave-L (shear that varies as a cosine of wavelength L mm). Labels +1 "
+        "or -1: bones and skin are one voxel too large, or too small, in the label map that the "
         "registration was given.",
         "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. A finer resolution "
         "means more noise, so report both.",
