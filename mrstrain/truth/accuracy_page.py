@@ -178,16 +178,19 @@ def _told(cell: Cell) -> Cell:
 
 
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
-    table = Table(
-        "Coverage of the error model",
-        (*_CONDITION, "motion", "tissue", "voxels covered, %", "remaining error, mean", "figures covered, %"),
-        tuple(
-            (*r.condition, r.motion, r.tissue, 100 * r.voxels_within, r.left_over, 100 * r.figures_within) for r in rows
-        ),
-        "Each heel is compared with a model fitted to the other heels under the same motions. Voxels covered: truth "
-        "within 1.96 SD; 95 % if the model is correct. Figures covered: percentiles and volumes of the tissue within "
-        "the intervals that `register` would give.",
+    shares = "voxels", "normal strain", "shear strain", "displacement", "figures"
+    columns = *_CONDITION, "motion", "tissue", "remaining error, mean", *(f"{name}, %" for name in shares)
+
+    def cells(r: CoverageRow) -> tuple[Cell, ...]:
+        within = r.voxels_within, r.normal_strain_within, r.shear_strain_within, r.displacement_within, r.figures_within
+        return (*r.condition, r.motion, r.tissue, r.left_over, *(100 * share for share in within))
+
+    note = (
+        "Each motion is compared with a model fitted to the other motions. Voxels: true max. shear within 1.96 SD; if "
+        "the model is correct, 95 %. Normal strain, shear strain, displacement: the same for components. Figures: "
+        "percentiles and volumes of the tissue within the intervals that `register` would give."
     )
+    table = Table("Coverage of the error model", columns, tuple(cells(row) for row in rows), note)
     return Section("Validation of the error model", tables=(table,))
 
 

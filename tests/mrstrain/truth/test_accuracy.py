@@ -41,7 +41,7 @@ from tests.quick import QUICK
 
 def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
     cases = accuracy_cases()
-    assert len({c.name for c in cases}) == len(cases) < 120
+    assert len({c.name for c in cases}) == len(cases) < 140
     assert not any(9000 <= c.seed <= 9999 for c in cases)  # set aside for published figures
     assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
 
@@ -265,4 +265,4 @@ def test_a_run_is_that_of_its_case(
     assert not one.true_shear.any()
     assert 0.001 < np.median(one.shear) < 0.15  # voxels of 2.3 mm; .018 at 0.8 mm
     assert one.estimated_snr == pytest.approx(25.0, rel=0.15)
-    assert one.correlation[0] > one.correlation[3]
+    assert (one.correlation[:, 0] > one.correlation[:, 3]).all()
