@@ -151,7 +151,7 @@ def read_error_model(path: Path | str) -> ErrorModel:
     """Read a file of `ErrorModel.write`; InputError if it cannot be read or is not an error model."""
     try:
         return _parsed(read_json(Path(path)))
-    except (OSError, ValueError, KeyError, TypeError) as failure:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as failure:
         what = f"not an error model written by `mrstrain accuracy` ({type(failure).__name__}: {failure})."
         raise InputError(f"{path}: {what}") from failure
 
@@ -197,7 +197,7 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
         )
         if not (t.runs and all(sound)):
             raise ValueError(f"a table has no runs, or its figures are not {shape} finite numbers")
-        if t.has_components and not min(t.component_correlation_mm) > 0:
+        if t.has_components and not all(length > 0 for length in t.component_correlation_mm):
             raise ValueError("it has no correlation length of the components")
         rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
         if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):

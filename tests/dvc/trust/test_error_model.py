@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -79,6 +80,45 @@ def test_damaged_tables_are_refused_when_read(tmp_path: Path, change: dict) -> N
     ErrorModel("heel-mr", "", (replace(TABLE, **change),), "made up").write(tmp_path / "model.json")
     with pytest.raises(InputError, match="not an error model"):
         read_error_model(tmp_path / "model.json")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"component_correlation_mm": [3.0, None]},
+        {"component_correlation_mm": [None, 3.0]},
+        {"component_correlation_mm": []},
+        {"component_correlation_mm": None},
+        {"errors": [1]},
+        None,
+    ],
+)
+def test_damaged_tables_of_components_are_refused_when_read(tmp_path: Path, change: dict | None) -> None:
+    rows = {POOLED: np.full((6, 2, 3), 0.02)}
+    table = replace(TABLE, whole=rows, runs=(rows,), component_correlation_mm=(3.0, 5.0))
+    path = tmp_path / "model.json"
+    ErrorModel("heel-mr", "", (table,), "made up").write(path)
+    assert read_error_model(path).tables[0].component_correlation_mm == (3.0, 5.0)
+    told = json.loads(path.read_text())
+    told["tables"] = [[1] if change is None else told["tables"][0] | change]
+    path.write_text(json.dumps(told))
+    with pytest.raises(InputError, match=r"model.json: not an error model"):
+        read_error_model(path)
+
+
+def test_models_of_former_versions_are_read(tmp_path: Path) -> None:
+    """Format 1: bias and standard deviation of the maximum shear strain, without components."""
+    path = tmp_path / "model.json"
+    ErrorModel("heel-mr", "", (replace(TABLE, widening=3.0),), "made up").write(path)
+    told = json.loads(path.read_text())
+    (table,) = told["tables"]
+    for new, former in (("errors", "bias_and_sd"), ("errors_of_each_run", "bias_and_sd_of_each_run")):
+        table[former] = table.pop(new)
+    del table["component_correlation_mm"]
+    path.write_text(json.dumps(told | {"format": 1}))
+    (again,) = read_error_model(path).tables
+    np.testing.assert_allclose(again.whole["fat"], FAT)
+    assert (again.widening, again.has_components) == (3.0, False)
 
 
 def test_nearest_table_is_taken_and_a_far_one_refused() -> None:
