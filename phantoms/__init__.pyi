@@ -2,7 +2,7 @@ from . import figures
 from .accuracy_run import RIGID, AccuracyCase, ErrorSamples, distances_mm, measure_run, sampled_errors
 from .anatomy import FAT_SIGNAL, TISSUES, Heel
 from .bodies import EllipsoidUnion
-from .error_model import CoverageRow, coverage_rows, fit_error_model
+from .error_model import CoverageRow, coverage_rows, fit_error_model, widened_for
 from .error_tables import (
     SOFT,
     ErrorRow,
@@ -56,5 +56,5 @@ __all__ = [
     "floor_rows", "heel_grid", "heel_pair", "labels_of", "labels_to_mesh", "material_points", "measure_run",
     "misdrawn", "motion_named", "pressed", "random_foot_motion", "resolution_rows", "resolved_mm", "run_rows",
     "sampled_errors", "scan", "sensitivity", "sheared", "sliding", "star_pair", "star_rows", "stretched",
-    "swelling", "synthetic_warp", "tissue_bar", "under_load", "under_plate", "wavelength_recovered",
+    "swelling", "synthetic_warp", "tissue_bar", "under_load", "under_plate", "wavelength_recovered", "widened_for",
 ]  # fmt: skip

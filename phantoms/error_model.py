@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from dvc import ErrorModel, ErrorTable
-from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 from dvc.trust.components import NORMAL, SHEAR
+from dvc.trust.error_model import POOLED
 from dvc.trust.uncertainty import figures_of, widened
 from phantoms.accuracy_run import ErrorSamples
 from phantoms.error_moments import BONE_MM, FEW, KNOTS, errors_by_cell
@@ -18,6 +19,7 @@ from phantoms.error_tables import SOFT, OfCondition, by_condition, of_tissue
 
 _THRESHOLDS = (0.1, 0.3)
 _DRAWS = 8  # of each training run, when coverage of the intervals is evaluated
+_OF_OTHERS = 0.97  # of the figures of other motions
 _SOME = 20_000  # of a tissue's samples that figures are drawn of
 
 
@@ -73,6 +75,22 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
     return ErrorModel(Path(presets.pop()).name, digest, tables, source)
 
 
+def widened_for(model: ErrorModel, runs: Sequence[ErrorSamples]) -> ErrorModel:
+    """Widen the intervals of an error model, in all its conditions, by runs of motions that it was not fitted to.
+
+    They then hold 97 % of the figures of each tissue, and of soft tissue as a whole, in these runs: more than 95 %, as
+    motions differ. InputError if a run has no table that is close.
+    """
+    scores: dict[str, list[FloatArray]] = {}
+    for run in runs:
+        table = model.table_for(np.array(run.case.spacing_mm), run.estimated_snr)
+        for tissue in (*(tissue for _, tissue in _large([run])), POOLED):
+            scores.setdefault(tissue, []).append(_scores(run, tissue, table))
+    factors = {t: max(1.0, round(float(np.quantile(np.concatenate(s), _OF_OTHERS)), 3)) for t, s in scores.items()}
+    whole = factors.pop(POOLED)
+    return replace(model, tables=tuple(replace(t, widening=whole, widening_of=factors) for t in model.tables))
+
+
 def coverage_rows(runs: Sequence[ErrorSamples], model: ErrorModel | None = None) -> list[CoverageRow]:
     """Coverage of an error model on these runs.
 
@@ -83,17 +101,19 @@ def coverage_rows(runs: Sequence[ErrorSamples], model: ErrorModel | None = None)
     for condition, some in by_condition([r for r in runs if r.case.wavelength_mm is None]):
         if model is None:
             validations = _validations(some)
-            factor = _widening(validations)
+            factor: float | None = _widening(validations)
         else:
             table = model.table_for(np.array(some[0].case.spacing_mm), some[0].estimated_snr)
-            validations, factor = [_validated(run, tissue, table) for run, tissue in _large(some)], table.factor
+            validations, factor = [_validated(run, tissue, table) for run, tissue in _large(some)], None
         for motion, tissue in dict.fromkeys((v.motion, v.tissue) for v in validations):
             mine = [v for v in validations if (v.motion, v.tissue) == (motion, tissue)]
             within, *components = (
                 float(np.concatenate(some).mean()) for some in zip(*(v.within for v in mine), strict=True)
             )
             remaining = float(np.concatenate([v.remaining for v in mine]).mean())
-            figures = float(np.mean([v.scores <= factor for v in mine]))
+            figures = float(
+                np.mean([v.scores <= (table.factor_of(tissue) if factor is None else factor) for v in mine])
+            )
             rows.append(CoverageRow(*condition, motion, tissue, within, remaining, figures, *components))
     return rows
 
@@ -159,22 +179,30 @@ def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation
         left = np.abs(run.strain_error[kept] - shrinkage * run.strain[kept])
         within += [left[:, NORMAL] < 1.96 * normal, left[:, SHEAR] < 1.96 * sheared]
         within.append(np.abs(run.u_error_mm[kept]) < 1.96 * displaced)
-    return _Validation(run.case.motion, tissue, remaining, tuple(within), _scores(shear, true, tissue, at_mm, table))
+    return _Validation(run.case.motion, tissue, remaining, tuple(within), _scores(run, tissue, table))
 
 
-def _scores(
-    shear: FloatArray, true: FloatArray, tissue: str, to_bone_mm: Float32Array, table: ErrorTable
-) -> FloatArray:
-    """Distance of the true figures of a tissue from the middle of figures drawn, in units of the interval there."""
-    random, few = np.random.default_rng(1), slice(None, None, -(-len(shear) // _SOME))
-    some, at_mm, draws = shear[few], to_bone_mm[few], []
-    for number in range(len(table.runs)):
-        b, s = table.expected(tissue, some, at_mm, number)
+def _scores(run: ErrorSamples, tissue: str, table: ErrorTable) -> FloatArray:
+    """Distance of the true figures of a tissue from the middle of figures drawn, in units of the interval there.
+
+    Soft tissue is drawn tissue by tissue, and its figures are those of all.
+    """
+    random, names = np.random.default_rng(1), SOFT if tissue == POOLED else (tissue,)
+    apart = -(-np.count_nonzero(of_tissue(run.tissue, tissue)) // _SOME)
+    parts = [of_tissue(run.tissue, name) for name in names]
+    shear = [run.shear[part][::apart].astype(np.float64) for part in parts]
+    at_mm, every, draws = [run.to_bone_mm[part][::apart] for part in parts], np.concatenate(shear), []
+    for registration in range(len(table.runs)):
+        expected = [
+            table.expected(name, measured, mm, registration)
+            for name, measured, mm in zip(names, shear, at_mm, strict=True)
+        ]
+        bias, sd = (np.concatenate(rows) for rows in zip(*expected, strict=True))
         for _ in range(_DRAWS):
-            drawn = np.maximum(some - b - s * random.standard_normal(len(b)), 0.0)
+            drawn = np.maximum(every - bias - sd * random.standard_normal(len(bias)), 0.0)
             draws.append(figures_of(drawn, 1.0, _THRESHOLDS))
     low, middle, high = widened(np.array(draws), 1.0)
-    off = figures_of(true, 1.0, _THRESHOLDS) - middle
+    off = figures_of(run.true_shear[of_tissue(run.tissue, tissue)].astype(np.float64), 1.0, _THRESHOLDS) - middle
     reach = np.where(off < 0, middle - low, high - middle)
     return np.where(off == 0, 0.0, np.abs(off) / np.maximum(reach, 1e-9))
 

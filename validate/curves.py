@@ -175,7 +175,7 @@ class Band:
 
 def bands(
     truths: Iterable[FloatArray], models: Mapping[str, FloatArray], volumes_ml: FloatArray,
-    tissues: Mapping[str, np.ndarray], widening: float, narrowed: Callable[[FloatArray], FloatArray],
+    tissues: Mapping[str, np.ndarray], widening: Callable[[str], float], narrowed: Callable[[FloatArray], FloatArray],
     strains: tuple[float, float] = RANGE, sensitivities: Mapping[str, Sensitivity] | None = None,
 ) -> dict[str, Band]:  # fmt: skip
     """Bands of the true curve by tissue, from true fields drawn for all cells at once.
@@ -186,6 +186,8 @@ def bands(
         Maximum shear strain of each drawn true field, in the cells; see `dvc.trust.truth_draws.TruthDraws`.
     models, tissues : mapping of name to (n,)
         Maximum shear strain of each model in the cells, and the cells of each tissue.
+    widening : callable
+        ``widening(tissue)``, as `dvc.trust.error_model.ErrorTable.factor_of`.
     narrowed : callable
         Narrows a drawn true field (n,) to the spread of a perfect model: `dvc.trust.truth_draws.TruthDraws.narrowed`.
     strains : (low, high)
@@ -231,14 +233,15 @@ def bands(
     result = {}
     for name, inside in tissues.items():
         on_outer, on_inner = np.split(np.array([of[name] for of in drawn]), [_GRID], axis=1)
-        least, _, most = widened(on_outer, widening)
+        factor = widening(name)
+        least, _, most = widened(on_outer, factor)
         following = on_inner[1::_EVERY]  # the draws after those that serve as perfect models
         of_perfect = {model: np.array([one[name] for one in wrong.get(model, perfect)]) for model in models}
         floors = {model: float(np.median(areas(of[: len(following)], following))) for model, of in of_perfect.items()}
         of_models = {model: areas(simulated[name], on_inner) for model, simulated in curves.items()}
         of_varied = {model: areas(np.array([one[name] for one in of]), on_inner) for model, of in varied.items()}
         most = np.minimum(most, volumes_ml[inside].sum())
-        result[name] = Band(outer, least, most, of_models, floors, widening, of_varied, on_outer)
+        result[name] = Band(outer, least, most, of_models, floors, factor, of_varied, on_outer)
     return result
 
 

@@ -279,7 +279,7 @@ def _decompositions(
         bias, sd = error.expected(tissue.lower(), measured, fields.to_bone_mm[where].astype(np.float32))
         u_cal = float(np.sqrt(np.average(bias**2 + sd**2, weights=fields.volumes_ml[where])))
         drawn = truths[:, where[fields.common]]
-        made[tissue] = decompose(measured, models, cells.part(where), u_cal, drawn, error.factor)
+        made[tissue] = decompose(measured, models, cells.part(where), u_cal, drawn, error.factor_of(tissue))
     return made
 
 
@@ -324,4 +324,4 @@ def _bands(
     models = {name: shear[common] for name, shear in _shears(fields).items()}
     inside = {name: where[common] for name, where in fields.parts.items()}
     volumes = fields.volumes_ml[common]
-    return bands(truths(), models, volumes, inside, error.factor, draws.narrowed, by.strains, uncertain)
+    return bands(truths(), models, volumes, inside, error.factor_of, draws.narrowed, by.strains, uncertain)

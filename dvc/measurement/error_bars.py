@@ -129,7 +129,8 @@ def _used(chosen: ErrorModel, table: ErrorTable, wider: Mapping[str, float]) -> 
     most = max(wider.values())
     widened = f"intervals widened {most:.1f} times by the synthetic warp of one pair, and valid for that pair alone"
     source = f"{chosen.source}; {widened}"
-    return replace(chosen, tables=(replace(table, widening=most * table.factor),), source=source)
+    of_tissue = {name: most * factor for name, factor in table.widening_of.items()}
+    return replace(chosen, tables=(replace(table, widening=most * table.factor, widening_of=of_tissue),), source=source)
 
 
 def _of_twin(rows: Sequence[Judged], twin: TwinCheck | None) -> str:
@@ -148,10 +149,10 @@ def _of_twin(rows: Sequence[Judged], twin: TwinCheck | None) -> str:
 def _held(table: ErrorTable) -> str:
     if not np.isfinite(table.widening):
         return "The coverage of these intervals is not known, because the study has only one registration."
-    return (
-        f"Intervals are widened {table.widening:.1f} times, so that they contain 95 % of the true figures when each "
-        "part of the study is compared with a model fitted to the rest."
-    )
+    factors = {f"{factor:.1f}" for factor in (table.widening_of or {"": table.factor}).values()}
+    times = " to ".join(dict.fromkeys((min(factors, key=float), max(factors, key=float))))
+    whose = "of finite-element models" if table.widening_of else "of the study when each part of it is left out"
+    return f"Intervals are widened {times} times, so that they contain 95 % of the true figures {whose}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:

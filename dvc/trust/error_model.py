@@ -9,7 +9,7 @@ that is strained and imaged like the study's phantoms, and for no other.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ class ErrorTable:
     # Factor on intervals as drawn, by which 95 % of the tissues' figures lay in them when each motion of the study
     # was judged by the others; NaN where there was one motion and one heel alone, and intervals stay as drawn.
     widening: float = float("nan")
+    widening_of: Mapping[str, float] = field(default_factory=dict)  # the same of one tissue, where it is known
     # The same distance for the errors of a component of the strain and of the displacement.
     component_correlation_mm: tuple[float, float] = (float("nan"), float("nan"))
 
@@ -62,6 +63,10 @@ class ErrorTable:
     def factor(self) -> float:
         """`widening`, and 1 where it is not known."""
         return 1.0 if np.isnan(self.widening) else self.widening
+
+    def factor_of(self, tissue: str) -> float:
+        """The factor of a tissue, and `factor` where it is not known."""
+        return self.widening_of.get(tissue.lower(), self.factor)
 
     @property
     def has_components(self) -> bool:
@@ -141,6 +146,7 @@ class ErrorModel:
             | {"to_bone_mm": t.to_bone_mm.tolist(), "errors": rounded(t.whole)}
             | {"errors_of_each_run": [rounded(run) for run in t.runs]}
             | {"correlation_mm": t.correlation_mm, "widening": plain(t.widening)}
+            | {"widening_of": dict(t.widening_of)}
             | {"component_correlation_mm": [plain(length) for length in t.component_correlation_mm]}
             for t in self.tables
         ]
@@ -180,6 +186,7 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
             runs=tuple(cells(run) for run in t[f"{name}_of_each_run"]),
             correlation_mm=float(t["correlation_mm"]),
             widening=number(t["widening"]),
+            widening_of={tissue: number(factor) for tissue, factor in t.get("widening_of", {}).items()},
             component_correlation_mm=(number(lengths[0]), number(lengths[1])),
             **{name: np.asarray(t[name], dtype=np.float64) for name in ("spacing_mm", "shear", "to_bone_mm")},
         )
@@ -199,6 +206,8 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
             raise ValueError(f"a table has no runs, or its figures are not {shape} finite numbers")
         if t.has_components and not all(length > 0 for length in t.component_correlation_mm):
             raise ValueError("it has no correlation length of the components")
+        if not all(factor >= 1.0 for factor in t.widening_of.values()):
+            raise ValueError("a widening of a tissue is below 1")
         rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
         if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
             raise ValueError("a voxel size, SNR or bin is not positive, or the bins do not increase")

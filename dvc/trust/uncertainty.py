@@ -92,7 +92,7 @@ def uncertainty_of(
     for (name, where), volume, figures in zip(measured.items(), volumes, drawn, strict=True):
         shear, factor = max_shear[where].astype(np.float64), wider.get(name, 1.0)
         sigma[where] = factor * table.expected(name, shear, to_bone_mm[where])[1]
-        low, middle, high = widened(figures, factor * table.factor)
+        low, middle, high = widened(figures, factor * table.factor_of(name))
         high[3:] = np.minimum(high[3:], volume)
         each = zip(names, figures_of(shear, volume), middle, low, high, strict=True)
         intervals += [Interval(name, figure, *map(float, numbers)) for figure, *numbers in each]

@@ -24,6 +24,7 @@ from phantoms import (
     motion_named,
     resolution_rows,
     wavelength_recovered,
+    widened_for,
 )
 
 COARSE = (2.3, 2.3, 2.3)
@@ -199,6 +200,25 @@ def test_intervals_hold_for_a_motion_that_was_left_out() -> None:
     as_drawn = fit_error_model(runs, "", "")
     as_drawn = replace(as_drawn, tables=(replace(table, widening=1.0),))
     assert next(r for r in coverage_rows(new, as_drawn) if r.tissue == "fat").figures_within < 0.5
+
+
+def test_intervals_are_widened_by_motions_of_another_origin() -> None:
+    """By as much as their errors need, of each tissue and of the whole."""
+    runs = [samples(replace(CASE, seed=s), sd=0.01, count=20_000, offset=o) for s, o in ((1, 0.004), (2, -0.004))]
+    model, others = fit_error_model(runs, "", ""), []
+    for seed, offset in enumerate((0.02, -0.02, 0.01, -0.01), start=3):
+        one = samples(replace(CASE, motion="model-Load1", seed=seed), sd=0.01, count=20_000, offset=offset)
+        skin = next(number for number, name in TISSUES.items() if name == "skin")
+        others.append(replace(one, tissue=np.where(np.arange(20_000) % 4 > 0, FAT, skin)))
+    (table,) = widened_for(model, others).tables
+    assert set(table.widening_of) == {"fat", "skin"}
+    assert table.factor_of("Fat") == table.widening_of["fat"] > 2.0
+    assert table.factor_of("scar") == table.widening > 2.0
+    new = samples(replace(CASE, motion="another-Load1", seed=9), sd=0.01, count=20_000, offset=0.015)
+    as_drawn = replace(model, tables=(replace(model.tables[0], widening=1.0),))
+    for given, least, most in ((widened_for(model, others), 1.0, 1.0), (as_drawn, 0.0, 0.4)):
+        (row,) = (r for r in coverage_rows([new], given) if r.tissue == "fat")
+        assert least <= row.figures_within <= most
 
 
 def test_components_err_as_the_samples_do() -> None:

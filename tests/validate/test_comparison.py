@@ -249,7 +249,9 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
             ).drawn()
         )
         draws = TruthDraws(points, truth + 0.01 + noise, tissue, distance, error_table(0.01, 0.04), seed)
-        band = bands((draws.drawn() for _ in range(200)), models, volumes, everywhere, 1.3, draws.narrowed)[ALL]
+        band = bands((draws.drawn() for _ in range(200)), models, volumes, everywhere, lambda _: 1.3, draws.narrowed)[
+            ALL
+        ]
         _, low, high, _ = band.interval("far")
         held_by_equal.append(band.interval("equal")[1] == 0.0)
         held.append(low <= true_area["far"] <= high)
@@ -284,7 +286,9 @@ def test_a_perfect_model_is_not_ruled_out_however_strain_is_spread(spread: str) 
     for seed in range(8):
         noise = 0.5 - TruthDraws(points, flat, tissue, distance, error_table(0.0, 0.04), 100 + seed).drawn()
         draws = TruthDraws(points, truth + noise, tissue, distance, error_table(0.0, 0.04), seed)
-        band = bands((draws.drawn() for _ in range(100)), models, volumes, everywhere, 1.3, draws.narrowed)[ALL]
+        band = bands((draws.drawn() for _ in range(100)), models, volumes, everywhere, lambda _: 1.3, draws.narrowed)[
+            ALL
+        ]
         held.append(band.interval("equal")[1] == 0.0)
         low, high = band.interval("off")[1:3]
         from_zero.append(low == 0.0 or not low <= true <= high)
@@ -378,7 +382,7 @@ def test_a_biased_measurement_ranks_by_what_lies_behind_it() -> None:
     )
     models = {"copy": truth - 0.07, "right": truth}
     everywhere = {ALL: np.ones(len(truth), dtype=bool)}
-    band = bands((draws.drawn() for _ in range(200)), models, volumes, everywhere, 1.0, draws.narrowed)[ALL]
+    band = bands((draws.drawn() for _ in range(200)), models, volumes, everywhere, lambda _: 1.0, draws.narrowed)[ALL]
     assert area_between(truth - 0.07, models["copy"], volumes) < area_between(truth - 0.07, truth, volumes)
     assert band.interval("right")[0] < band.interval("copy")[0]
     assert band.surely_below("right", "copy")

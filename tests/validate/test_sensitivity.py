@@ -173,7 +173,7 @@ def test_intervals_hold_the_area_of_the_model_with_right_inputs_as_often_as_they
         change = {"force": np.full(len(points), spread)}
         given = {name: Sensitivity.of(name, change, 100, seed) for name in models} if told else {}
         noisy = (truth + random.normal(0.0, 0.002) for _ in range(100))
-        band = bands(noisy, models, volumes, everywhere, 1.0, lambda field: field, sensitivities=given)[ALL]
+        band = bands(noisy, models, volumes, everywhere, lambda _: 1.0, lambda field: field, sensitivities=given)[ALL]
         for name, shear in right.items():
             low, high = band.interval(name)[1:3]
             held.append(

@@ -46,6 +46,24 @@ def test_each_run_has_its_own_figures() -> None:
     np.testing.assert_allclose([bias[0], sd[0]], [0.015, 0.04])
 
 
+def test_each_tissue_has_its_own_widening(tmp_path: Path) -> None:
+    """Twice as wide in one tissue, and by the common factor elsewhere; also when written and read."""
+    inside = np.ones(GRID.shape, dtype=bool)
+    shear, far = np.full(GRID.shape, 0.25, dtype=np.float32), np.full(GRID.shape, 9.0, dtype=np.float32)
+    table = replace(TABLE, widening=1.5, widening_of={"fat": 3.0})
+    ErrorModel("heel-mr", "", (table,), "made up").write(tmp_path / "model.json")
+    (again,) = read_error_model(tmp_path / "model.json").tables
+    assert (again.factor, again.factor_of("fat"), again.factor_of("skin")) == (1.5, 3.0, 1.5)
+    widths = []
+    for one in (again, replace(again, widening_of={})):
+        median = uncertainty_of(shear, GRID, {"Fat": inside}, far, one).intervals[0]
+        widths.append(median.high - median.low)
+    assert widths[0] == pytest.approx(2.0 * widths[1], rel=0.01)
+    ErrorModel("heel-mr", "", (replace(TABLE, widening_of={"fat": 0.5}),), "made up").write(tmp_path / "model.json")
+    with pytest.raises(InputError, match="widening of a tissue is below 1"):
+        read_error_model(tmp_path / "model.json")
+
+
 def test_model_survives_its_file(tmp_path: Path) -> None:
     model = ErrorModel("heel-mr", "abc", (TABLE, replace(TABLE, snr=50.0)), "made up")
     model.write(tmp_path / "model.json")
