@@ -351,7 +351,7 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
             what = "the rigid motion of the bone was not removed from this measurement, so displacements include it."
             notes.append(f"{load}: {what}")
         if error is not None and np.isnan(error.widening):
-            what = "the error model is from one subject, so the coverage of its intervals is unknown (not widened)."
+            what = "the error model is from one motion of one subject, so the coverage of its intervals is unknown."
             notes.append(f"{load}: {what}")
         notes += [
             f"{load}: {name} covers only {volumes[name] / volumes['mesh']:.0%} of the mesh. All models are compared on "

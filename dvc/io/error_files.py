@@ -1,6 +1,5 @@
 """The error bars of one load in its results folder: their writer and reader."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -28,6 +27,7 @@ from dvc.io.result_folder import (
     same_grid,
     there,
 )
+from dvc.own_files import read_rows
 from dvc.trust.components import ComponentRow, ComponentUncertainty
 from dvc.trust.error_model import ErrorModel, read_error_model
 from dvc.trust.uncertainty import Interval, Uncertainty
@@ -62,17 +62,17 @@ def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel]
     model, sigma = read_error_model(folder / ERROR_MODEL), read_scalar(folder / SIGMA, grid)
     intervals = _read_rows(folder / INTERVALS, Interval, 2)
     sure = Uncertainty(sigma.values, intervals, model.tables[0])
-    if (folder / SOFT_TISSUES).is_file():
-        tissues = read_labels(folder / SOFT_TISSUES, there(folder / SOFT_TISSUES.replace(".nii.gz", ".csv")))
+    if model.tables[0].has_components or (folder / SOFT_TISSUES).is_file():  # not in folders of former versions
+        tissues = read_labels(there(folder / SOFT_TISSUES), there(folder / SOFT_TISSUES.replace(".nii.gz", ".csv")))
         same_grid(folder / SOFT_TISSUES, tissues.grid, grid)
         regions = {name: tissues.labels == number for number, name in tissues.names.items()}
         to_bone = read_scalar(folder / TO_BONE, grid).values
-        sure = Uncertainty(sure.sigma, intervals, sure.table, regions, to_bone, _read_components(folder, grid))
+        sure = Uncertainty(sure.sigma, intervals, sure.table, regions, to_bone, _read_components(folder, grid, model))
     return sure, model
 
 
-def _read_components(folder: Path, grid: Grid) -> ComponentUncertainty | None:
-    if not (folder / COMPONENTS).is_file():
+def _read_components(folder: Path, grid: Grid, model: ErrorModel) -> ComponentUncertainty | None:
+    if not model.tables[0].has_components:
         return None
     names = SIGMA_NORMAL, SIGMA_SHEAR, SIGMA_DISPLACEMENT
     normal, shear, displacement_mm = (read_scalar(folder / name, grid).values for name in names)
@@ -89,9 +89,8 @@ def _read_rows(path: Path, kind: type[_Row], words: int) -> tuple[_Row, ...]:
     """Rows of a table, in each of which some words come before the numbers."""
     names = [f.name for f in fields(kind)]
     try:
-        with there(path).open(newline="", encoding="utf-8") as file:
-            rows = [[row[name] for name in names] for row in csv.DictReader(file)]
-        return tuple(kind(*map(str, row[:words]), *map(float, row[words:])) for row in rows)  # type: ignore[arg-type]
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as failure:
+        rows = [[row[name] for name in names] for row in read_rows(there(path))]
+        return tuple(kind(*row[:words], *map(float, row[words:])) for row in rows)  # type: ignore[arg-type]
+    except (OSError, ValueError, KeyError) as failure:
         why = f"{type(failure).__name__}: {failure}"
         raise InputError(f"{path}: not a table of intervals ({why}). {AGAIN}") from failure

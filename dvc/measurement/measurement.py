@@ -225,8 +225,9 @@ class Measurement:
     def draws(self, count: int, *, seed: int = 1) -> Iterator[TrueField]:
         """Draw true fields that agree with what was measured and with its errors, about 1 s each at 128^3 voxels.
 
-        Errors are alike in neighbouring voxels, and each draw errs as one registration of the accuracy study did, so
-        any figure computed from each of the fields has the uncertainty of its values over the draws.
+        Errors are alike in neighbouring voxels, and each draw errs as one registration of the accuracy study did. The
+        spread of a figure over the draws is that of one voxel's error where the figure is of few voxels. Of a whole
+        tissue it is too small: `intervals` are widened for that, and draws are not.
 
         Parameters
         ----------

@@ -52,7 +52,7 @@ class FieldDraws:
     to_bone_mm : (ni, nj, nk)
         Distance to bone.
     table : ErrorTable
-        With the errors of components; InputError without them.
+        With the errors of components; InputError without them, or if no voxel of the tissues has a strain.
     wider : mapping, optional
         Further factors on the deviations of some regions.
     """
@@ -69,7 +69,9 @@ class FieldDraws:
         self._maps, self._table, self._wider = maps, table, wider
         self._to_bone_mm, self._regions = to_bone_mm, {n: at & np.isfinite(maps.max_shear) for n, at in regions.items()}
         self._random = np.random.default_rng(seed)
-        self._at = np.any(list(self._regions.values()), axis=0)
+        self._at = np.any([np.zeros(maps.grid.shape, dtype=bool), *self._regions.values()], axis=0)
+        if not self._at.any():
+            raise InputError("True fields cannot be drawn, because there is no soft tissue whose strain is known.")
         points = np.argwhere(self._at) * maps.grid.spacing_mm
         lengths = (table.correlation_mm, *table.component_correlation_mm)
         self._noise = [GaussianField(points, maps.grid.spacing_mm, length, self._random) for length in lengths]

@@ -50,7 +50,7 @@ from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
-_BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
+_BYTES_PER_VOXEL = 35  # of one image's results: 27 as measured, 5 with the plate's axes
 
 
 @door

@@ -122,3 +122,26 @@ def test_a_draw_errs_as_one_registration_did() -> None:
         xx.add(round(float(field.green_lagrange[HALF][0, 0]), 4))
     assert shear == {0.27, 0.33}
     assert xx == {0.16, 0.24}
+
+
+def test_draws_are_wider_in_tissues_whose_error_bars_did_not_hold() -> None:
+    """All deviations of the fat are three times as large, and those of other tissue are not; bias and mean stay."""
+    uniform = maps(shear=0.5)
+    draws = FieldDraws(uniform, {"fat": HALF, "muscle": ~HALF}, FAR, TABLE, seed=3, wider={"fat": 3.0})
+    some = [draws.drawn() for _ in range(40)]
+    for name, sizes in (
+        ("max_shear", 0.02),
+        ("green_lagrange", [0.03, 0.02, 0.02, 0.03, 0.02, 0.03]),
+        ("displacement_mm", 0.4),
+    ):
+        values = np.array([getattr(d, name) for d in some])
+        for where, factor in ((HALF, 3.0), (~HALF, 1.0)):
+            spread = values[:, where].std(axis=0).mean(axis=0)
+            np.testing.assert_allclose(spread, factor * np.asarray(sizes), rtol=0.06, err_msg=name)
+    assert np.mean([d.max_shear[HALF] for d in some]) == pytest.approx(0.49, abs=0.005)
+
+
+@pytest.mark.parametrize("regions", [{}, {"fat": np.zeros(GRID.shape, dtype=bool)}])
+def test_draws_without_a_voxel_are_refused(regions: dict) -> None:
+    with pytest.raises(InputError, match="no soft tissue whose strain is known"):
+        FieldDraws(maps(), regions, FAR, TABLE)
