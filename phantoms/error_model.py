@@ -154,10 +154,29 @@ def _table(runs: Sequence[ErrorSamples]) -> ErrorTable:
     whole, each = errors_by_cell(runs)
     snr = float(np.median([r.estimated_snr for r in runs]))
     shear_mm, *component_mm = (_correlation_mm(runs, n) for n in range(3))
-    return ErrorTable(
+    table = ErrorTable(
         np.array(runs[0].case.spacing_mm), snr, KNOTS, BONE_MM, whole, tuple(each), shear_mm,
         component_correlation_mm=(component_mm[0], component_mm[1]),
     )  # fmt: skip
+    return replace(table, shared={tissue: _shared(runs, tissue, table) for tissue in (*SOFT, POOLED)})
+
+
+def _shared(runs: Sequence[ErrorSamples], tissue: str, table: ErrorTable) -> FloatArray:
+    """Fraction of the variance of the components' errors that is the same in all voxels of a run: strain, displacement.
+
+    As if all that the mean over the tissue varies by were that part; zeros where the tissue is nowhere.
+    """
+    of_means, of_all = np.zeros((2, 2))
+    for run in runs:
+        kept = of_tissue(run.tissue, tissue)
+        if np.count_nonzero(kept) < FEW:
+            continue
+        shear = run.shear[kept].astype(np.float64)
+        shrinkage = table.expected_components(tissue, shear, run.to_bone_mm[kept])[0]
+        left = run.strain_error[kept] - shrinkage[:, None] * run.strain[kept], run.u_error_mm[kept].astype(np.float64)
+        of_means += [np.mean(error.mean(axis=0) ** 2) for error in left]
+        of_all += [np.mean(error**2) for error in left]
+    return of_means / np.maximum(of_all, 1e-12)
 
 
 def _widening(validations: Sequence[_Validation]) -> float:

@@ -22,6 +22,7 @@ from dvc.io.result_folder import (
     SIGMA_NORMAL,
     SIGMA_SHEAR,
     SOFT_TISSUES,
+    STRAIN_BIAS,
     TO_BONE,
     read_scalar,
     same_grid,
@@ -33,6 +34,12 @@ from dvc.trust.error_model import ErrorModel, read_error_model
 from dvc.trust.uncertainty import Interval, Uncertainty
 from dvc.trust.verdict import Verdict
 
+_MAPS = {
+    STRAIN_BIAS: "strain_bias",
+    SIGMA_NORMAL: "normal_strain",
+    SIGMA_SHEAR: "shear_strain",
+    SIGMA_DISPLACEMENT: "displacement_mm",
+}
 _Row = TypeVar("_Row", bound=Interval | ComponentRow)
 
 
@@ -49,9 +56,8 @@ def write_uncertainty(folder: Path, grid: Grid, sure: Uncertainty, model: ErrorM
         write_labels(folder / SOFT_TISSUES, LabelMap(grid, numbers, dict(enumerate(sure.regions, start=1))))
         write_image(folder / TO_BONE, Image(grid, sure.to_bone_mm))
     if (parts := sure.components) is not None:
-        maps = {SIGMA_NORMAL: parts.normal_strain, SIGMA_SHEAR: parts.shear_strain}
-        for name, sigma in (maps | {SIGMA_DISPLACEMENT: parts.displacement_mm}).items():
-            write_image(folder / name, Image(grid, sigma))
+        for file, name in _MAPS.items():
+            write_image(folder / file, Image(grid, getattr(parts, name)))
         _write_rows(folder / COMPONENTS, ComponentRow, parts.rows, verdict)
 
 
@@ -74,10 +80,8 @@ def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel]
 def _read_components(folder: Path, grid: Grid, model: ErrorModel) -> ComponentUncertainty | None:
     if not model.tables[0].has_components:
         return None
-    names = SIGMA_NORMAL, SIGMA_SHEAR, SIGMA_DISPLACEMENT
-    normal, shear, displacement_mm = (read_scalar(folder / name, grid).values for name in names)
-    rows = _read_rows(folder / COMPONENTS, ComponentRow, 3)
-    return ComponentUncertainty(normal, shear, displacement_mm, rows)
+    maps = {name: read_scalar(folder / file, grid).values for file, name in _MAPS.items()}
+    return ComponentUncertainty(**maps, rows=_read_rows(folder / COMPONENTS, ComponentRow, 3))
 
 
 def _write_rows(path: Path, kind: type[_Row], rows: Sequence[_Row], verdict: Verdict) -> None:

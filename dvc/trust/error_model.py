@@ -58,6 +58,9 @@ class ErrorTable:
     widening_of: Mapping[str, float] = field(default_factory=dict)  # the same of one tissue, where it is known
     # The same distance for the errors of a component of the strain and of the displacement.
     component_correlation_mm: tuple[float, float] = (float("nan"), float("nan"))
+    # By tissue, the fraction of the variance of a component's error that is the same in all voxels of a registration,
+    # (2,): of the strain and of the displacement.
+    shared: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def factor(self) -> float:
@@ -67,6 +70,10 @@ class ErrorTable:
     def factor_of(self, tissue: str) -> float:
         """The factor of a tissue, and `factor` where it is not known."""
         return self.widening_of.get(tissue.lower(), self.factor)
+
+    def shared_of(self, tissue: str) -> FloatArray:
+        """`shared` (2,) of a tissue, that of all soft tissue where it is not known, or zeros."""
+        return self.shared.get(tissue.lower(), self.shared.get(POOLED, np.zeros(2)))
 
     @property
     def has_components(self) -> bool:
@@ -146,7 +153,7 @@ class ErrorModel:
             | {"to_bone_mm": t.to_bone_mm.tolist(), "errors": rounded(t.whole)}
             | {"errors_of_each_run": [rounded(run) for run in t.runs]}
             | {"correlation_mm": t.correlation_mm, "widening": plain(t.widening)}
-            | {"widening_of": dict(t.widening_of)}
+            | {"widening_of": dict(t.widening_of), "shared": rounded(t.shared)}
             | {"component_correlation_mm": [plain(length) for length in t.component_correlation_mm]}
             for t in self.tables
         ]
@@ -186,6 +193,7 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
             runs=tuple(cells(run) for run in t[f"{name}_of_each_run"]),
             correlation_mm=float(t["correlation_mm"]),
             widening=number(t["widening"]),
+            shared=cells(t.get("shared", {})),
             widening_of={tissue: number(factor) for tissue, factor in t.get("widening_of", {}).items()},
             component_correlation_mm=(number(lengths[0]), number(lengths[1])),
             **{name: np.asarray(t[name], dtype=np.float64) for name in ("spacing_mm", "shear", "to_bone_mm")},
@@ -208,6 +216,8 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
             raise ValueError("it has no correlation length of the components")
         if not all(factor >= 1.0 for factor in t.widening_of.values()):
             raise ValueError("a widening of a tissue is below 1")
+        if not all(of.shape == (2,) and ((of >= 0.0) & (of <= 1.0)).all() for of in t.shared.values()):
+            raise ValueError("a shared fraction is not two numbers from 0 to 1")
         rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
         if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
             raise ValueError("a voxel size, SNR or bin is not positive, or the bins do not increase")

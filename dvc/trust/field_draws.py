@@ -13,8 +13,6 @@ from dvc.trust.components import NORMAL, SHEAR
 from dvc.trust.error_model import ROWS, ErrorTable
 from dvc.trust.truth_draws import GaussianField
 
-_THREE, _TWO = np.sqrt(3.0), np.sqrt(2.0)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueField:
@@ -40,8 +38,9 @@ class FieldDraws:
     """Draws of the truth on a measurement's voxels: in each, one registration of the study errs as it did.
 
     A value measured, less that registration's bias, less a Gaussian field of its standard deviation and of the error's
-    correlation length. Components of the strain err as an isotropic tensor does: a shear component with s, a normal one
-    with n, and two normal ones with the correlation 1 - 2 (s / n)^2, or -1/2 where that is less.
+    correlation length; a part of a component's error is the same in all voxels of a tissue (`ErrorTable.shared`).
+    Components of the strain err as an isotropic tensor does: a shear component with s, a normal one with n, and two
+    normal ones with the correlation 1 - 2 (s / n)^2, or -1/2 where that is less.
 
     Parameters
     ----------
@@ -75,30 +74,41 @@ class FieldDraws:
         points = np.argwhere(self._at) * maps.grid.spacing_mm
         lengths = (table.correlation_mm, *table.component_correlation_mm)
         self._noise = [GaussianField(points, maps.grid.spacing_mm, length, self._random) for length in lengths]
+        self._parts = {name: inside[self._at] for name, inside in self._regions.items()}
 
     def drawn(self) -> TrueField:
         """Draw a true field."""
-        run = int(self._random.integers(len(self._table.runs)))
-        bias, sd, shrinkage, normal, sheared, displaced = self._errors(run)
-        noise_of_shear, noise_of_strain, noise_of_u = self._noise
+        bias, sd, shrinkage, normal, sheared, displaced = self._errors(
+            int(self._random.integers(len(self._table.runs)))
+        )
         maps, at = self._maps, self._at
-        shear = maps.max_shear[at] - bias - sd * noise_of_shear.drawn()
+        shear = maps.max_shear[at] - bias - sd * self._noise[0].drawn()
         E, u = maps.green_lagrange[at], maps.displacement_mm[at]
-        E = E - shrinkage[:, None] * E - _isotropic(noise_of_strain, normal, sheared)
-        u = u - displaced[:, None] * np.stack([noise_of_u.drawn() for _ in range(3)], axis=1)
+        diagonal, others = (np.stack([self._of_component(0) for _ in range(3)]) for _ in range(2))
+        E = E - shrinkage[:, None] * E - isotropic(diagonal, others, normal, sheared)
+        u = u - displaced[:, None] * np.stack([self._of_component(1) for _ in range(3)], axis=1)
         return TrueField(self._on_grid(u), self._on_grid(E), self._on_grid(np.maximum(shear, 0.0)))
+
+    def _of_component(self, which: int) -> FloatArray:
+        """Noise (n,) of unit variance of a component of the strain (0) or the displacement (1)."""
+        noise = self._noise[1 + which].drawn()
+        for name, inside in self._parts.items():
+            shared = self._table.shared_of(name)[which]
+            noise[inside] = np.sqrt(1.0 - shared) * noise[inside] + np.sqrt(shared) * self._random.standard_normal()
+        return noise
 
     def _errors(self, run: int) -> FloatArray:
         """`ROWS` (6, n) of a registration of the study at the voxels."""
-        table, maps = self._table, self._maps
-        found = np.empty((*self._at.shape, len(ROWS)), dtype=np.float32)
-        for name, where in self._regions.items():
-            at = name, maps.max_shear[where].astype(np.float64), self._to_bone_mm[where], run
+        table = self._table
+        shear, to_bone_mm = self._maps.max_shear[self._at].astype(np.float64), self._to_bone_mm[self._at]
+        found = np.empty((len(ROWS), len(shear)))
+        for name, inside in self._parts.items():
+            at = name, shear[inside], to_bone_mm[inside], run
             bias, sd = table.expected(*at)
             shrinkage, *deviations = table.expected_components(*at)
             wider = self._wider.get(name, 1.0)
-            found[where] = np.stack([bias, wider * sd, shrinkage, *(wider * d for d in deviations)], axis=-1)
-        return np.asarray(found[self._at].T)
+            found[:, inside] = bias, wider * sd, shrinkage, *(wider * deviation for deviation in deviations)
+        return found
 
     def _on_grid(self, values: FloatArray) -> Float32Array:
         field = np.full((*self._at.shape, *values.shape[1:]), np.nan, dtype=np.float32)
@@ -106,13 +116,16 @@ class FieldDraws:
         return field
 
 
-def _isotropic(field: GaussianField, normal: FloatArray, shear: FloatArray) -> FloatArray:
-    """Noise (n, 6) of a symmetric tensor whose statistics are the same in all axes, of the deviations (n,) given."""
+def isotropic(diagonal: FloatArray, others: FloatArray, normal: FloatArray, shear: FloatArray) -> FloatArray:
+    """Noise (n, 6) of a symmetric tensor, of the deviations (n,) given of its normal and of its shear components.
+
+    ``diagonal`` and ``others`` (3, n) are independent noise of unit variance. The statistics are the same in all axes
+    where normal^2 >= 4/3 shear^2; where normal components vary less, their mean does not vary.
+    """
     drawn = np.empty((len(normal), 6))
-    for c in SHEAR:
-        drawn[:, c] = shear * field.drawn()
-    diagonal = np.stack([field.drawn() for _ in NORMAL], axis=1)
-    mean = diagonal.mean(axis=1)
-    volume = np.sqrt(np.maximum(normal**2 - 4.0 / 3.0 * shear**2, 0.0)) * _THREE * mean
-    drawn[:, NORMAL] = (_TWO * shear)[:, None] * (diagonal - mean[:, None]) + volume[:, None]
+    drawn[:, SHEAR] = (shear * others).T
+    mean = diagonal.mean(axis=0)
+    off_mean = np.minimum(2.0 * shear**2, 1.5 * normal**2)
+    of_mean = np.maximum(normal**2 - 2.0 / 3.0 * off_mean, 0.0)
+    drawn[:, NORMAL] = (np.sqrt(off_mean) * (diagonal - mean) + np.sqrt(3.0 * of_mean) * mean).T
     return drawn

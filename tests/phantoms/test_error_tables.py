@@ -242,6 +242,10 @@ def test_components_err_as_the_samples_do() -> None:
     sizes = np.sqrt(np.mean(left**2, axis=0))
     np.testing.assert_allclose(found, [slope, sizes[0], sizes[1], 0.4], rtol=0.05, atol=0.003)
     assert table.component_correlation_mm == pytest.approx((3.2, 3.2), abs=0.02)
+    assert (table.shared_of("fat") < 0.001).all()
+    off = [replace(r, u_error_mm=r.u_error_mm + np.float32(0.3) * sign) for r, sign in zip(runs, (1, -1), strict=True)]
+    (table,) = fit_error_model(off, "", "").tables
+    np.testing.assert_allclose(table.shared_of("fat"), [0.0, 0.09 / 0.25], atol=0.01)
     row = next(r for r in coverage_rows(runs) if r.tissue == "fat")
     within = row.normal_strain_within, row.shear_strain_within, row.displacement_within
     np.testing.assert_allclose(within, 0.95, atol=0.01)

@@ -40,8 +40,8 @@ def test_tissues_distances_and_components_are_read_as_they_were_written(folder: 
     np.testing.assert_array_equal(sure.to_bone_mm, FAR)
     rows = {(row.region, row.component): row for row in sure.components.rows}
     assert rows["scar, old", "xy"].mean == pytest.approx(0.1)
-    assert rows["scar, old", "xy"].standard_uncertainty == pytest.approx(0.02)
-    assert rows["fat", "z"].standard_uncertainty == pytest.approx(0.4)
+    assert rows["scar, old", "xy"].voxel_standard_uncertainty == pytest.approx(0.02)
+    assert rows["fat", "z"].voxel_standard_uncertainty == pytest.approx(0.4)
 
 
 def cut(path: Path) -> None:

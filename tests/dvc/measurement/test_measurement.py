@@ -132,7 +132,7 @@ def test_what_is_written_is_read_again(measured, written):
         measured.quality.as_dict(),
     )
     np.testing.assert_array_equal(again.sigma, measured.sigma)
-    for name in ("normal_strain", "shear_strain", "displacement_mm"):
+    for name in ("strain_bias", "normal_strain", "shear_strain", "displacement_mm"):
         np.testing.assert_array_equal(getattr(again.components, name), getattr(measured.components, name), err_msg=name)
     for one, other in zip(again.components.rows, measured.components.rows, strict=True):
         assert (one.region, one.component, one.unit) == (other.region, other.component, other.unit)

@@ -13,8 +13,7 @@ from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.trust.components import components_of
 from dvc.trust.error_model import POOLED, ErrorTable
-from dvc.trust.field_draws import FieldDraws, _isotropic
-from dvc.trust.truth_draws import GaussianField
+from dvc.trust.field_draws import FieldDraws, isotropic
 
 GRID = Grid((24, 24, 24), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
 FIGURES = np.array([0.01, 0.02, 0.1, 0.03, 0.02, 0.4])  # bias, sd, shrinkage, normal, shear, displacement
@@ -60,11 +59,13 @@ def test_components_have_the_uncertainty_of_the_table_in_soft_tissue_alone() -> 
         assert np.isnan(sigma[~HALF]).all()
         np.testing.assert_allclose(sigma[:12, :, :12], near, rtol=1e-5)
         np.testing.assert_allclose(sigma[12:, :, :12], far, rtol=1e-5)
+    np.testing.assert_allclose(found.strain_bias[HALF], 0.1)
     row = {r.component: r for r in found.rows}
+    assert (row["xx"].bias, row["yy"].bias, row["z"].bias) == pytest.approx((0.02, -0.01, 0.0))
     assert list(row) == ["x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz"]
     assert (row["y"].mean, row["y"].unit) == (pytest.approx(-2.0), "mm")
-    assert row["zz"].standard_uncertainty == pytest.approx(np.sqrt(np.mean(np.square([0.045, 0.09]))))
-    assert row["xz"].expanded_uncertainty == pytest.approx(2.0 * row["xz"].standard_uncertainty)
+    assert row["zz"].voxel_standard_uncertainty == pytest.approx(np.sqrt(np.mean(np.square([0.045, 0.09]))))
+    assert row["xz"].voxel_expanded_uncertainty == pytest.approx(2.0 * row["xz"].voxel_standard_uncertainty)
 
 
 def test_tables_without_components_have_neither() -> None:
@@ -77,19 +78,32 @@ def test_tables_without_components_have_neither() -> None:
 
 def test_noise_of_a_tensor_is_the_same_in_all_axes() -> None:
     """Deviations of normal and shear components, and the correlation of normal ones, before and after a rotation."""
-    points = np.random.default_rng(5).uniform(0.0, 300.0, (60_000, 3))
+    random = np.random.default_rng(7)
     turn = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
+    one = np.ones(60_000)
     for normal, shear in ((0.03, 0.02), (0.02, 0.0173)):
-        field = GaussianField(points, np.full(3, 3.0), 3.0, np.random.default_rng(7))
-        one = np.ones(len(points))
-        noise = _isotropic(field, normal * one, shear * one)
+        noise = isotropic(*random.standard_normal((2, 3, len(one))), normal * one, shear * one)
         full = noise[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
         for tensor in (full, turn.T @ full @ turn):
             diagonal = tensor[:, [0, 1, 2], [0, 1, 2]]
-            np.testing.assert_allclose(diagonal.std(axis=0), normal, rtol=0.03)
-            np.testing.assert_allclose(tensor[:, [0, 0, 1], [1, 2, 2]].std(axis=0), shear, rtol=0.03)
+            np.testing.assert_allclose(diagonal.std(axis=0), normal, rtol=0.02)
+            np.testing.assert_allclose(tensor[:, [0, 0, 1], [1, 2, 2]].std(axis=0), shear, rtol=0.02)
             alike = np.corrcoef(diagonal.T)[[0, 0, 1], [1, 2, 2]]
-            np.testing.assert_allclose(alike, 1.0 - 2.0 * (shear / normal) ** 2, atol=0.03)
+            np.testing.assert_allclose(alike, 1.0 - 2.0 * (shear / normal) ** 2, atol=0.02)
+    less = isotropic(*random.standard_normal((2, 3, len(one))), 0.02 * one, 0.03 * one)  # no isotropic tensor does that
+    np.testing.assert_allclose(less.std(axis=0), [0.02, 0.03, 0.03, 0.02, 0.03, 0.02], rtol=0.02)
+
+
+def test_a_part_of_a_components_error_is_that_of_the_whole_tissue() -> None:
+    """A quarter of the variance of the displacement, and none of that of the strain: their means vary accordingly."""
+    table = replace(TABLE, shared={POOLED: np.array([0.0, 0.25])})
+    draws = FieldDraws(maps(), {"fat": HALF}, FAR, table, seed=4)
+    some = [draws.drawn() for _ in range(150)]
+    u = np.array([d.displacement_mm[HALF] for d in some])
+    np.testing.assert_allclose(u.std(axis=0).mean(axis=0), 0.4, rtol=0.1)
+    np.testing.assert_allclose(u.mean(axis=1).std(axis=0), 0.2, rtol=0.2)
+    E = np.array([d.green_lagrange[HALF] for d in some])
+    assert (E.mean(axis=1).std(axis=0) < 0.004).all()
 
 
 def test_draws_vary_as_the_table_says_and_neighbours_alike() -> None:
