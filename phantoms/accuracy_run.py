@@ -302,5 +302,12 @@ def _autocorrelation(
     spacing = labels.grid.spacing_mm
     along = [np.moveaxis(field, axis, 0) for axis in range(3) if spacing[axis] > spacing.max() - 1e-6]
     lags = range(1, _LAGS + 1)
-    correlation = [float(np.mean([np.nanmean(f[lag:] * f[:-lag]) for f in along])) / variance for lag in lags]
+    correlation = [_mean_product(along, lag) / variance for lag in lags]
     return np.array(correlation), _STRIDE * float(spacing.max()) * np.array(lags, dtype=np.float64)
+
+
+def _mean_product(fields: list[Float32Array], lag: int) -> float:
+    """Mean product of values so far apart along the first axis, over the fields that have any; NaN if none has."""
+    products = [field[lag:] * field[:-lag] for field in fields]
+    means = [np.nanmean(product) for product in products if np.isfinite(product).any()]
+    return float(np.mean(means)) if means else np.nan
