@@ -19,7 +19,7 @@ from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
 from dvc.own_files import read_json
-from dvc.tables import read_table, refuse_half_a_line
+from dvc.tables import read_table
 from validate.rigid_parts import without_rigid_parts
 from validate.sensitivity import Variant
 from validate.tetrahedra import linear_tetrahedra
@@ -194,7 +194,6 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
 
 def _from_table(place: Path, source: MeshFile) -> FloatArray:
     head, rows = read_table(place)
-    refuse_half_a_line(place)
     named = [cell.strip(" '\"") for cell in head]
     node = next((n for n in _NODE_COLUMNS if n in named), None)
     parts = next((c for c in _COMPONENTS if set(c) <= set(named)), None)

@@ -13,6 +13,7 @@ from dvc.errors import ExtentError, InputError
 from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import read_json
+from dvc.tables import refuse_half_a_number
 from mrstrain.models.variant_files import VariantFolder
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import matrix_of, read_matrix
@@ -234,10 +235,15 @@ def _folder(place: Path) -> Path:
 def _settings(place: Path) -> dict[str, Any]:
     """The settings of a model; empty if there are none."""
     settings = _folder(place) / SETTINGS
+    if not settings.is_file():
+        return {}
     try:
-        return tomllib.loads(settings.read_text(encoding="utf-8")) if settings.is_file() else {}
+        text = settings.read_text(encoding="utf-8")
+        content = tomllib.loads(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{settings} is not a valid TOML file ({error}).") from error
+    refuse_half_a_number(settings, text)
+    return content
 
 
 def _reading(
