@@ -58,7 +58,15 @@ def refuse_half_a_line(path: Path) -> None:
             raise InputError(f"{path}: {_CUT}")
 
 
-def refuse_half_a_number(path: Path | str, text: str) -> None:
-    """InputError if the text of a TOML file ends within a number: all else that was cut is no TOML."""
+def refuse_damaged_toml(path: Path | str, text: str, content: object, key: str = "") -> None:
+    """InputError for damage that is valid TOML: a text that ends within a number, a null character in a string."""
     if re.search(r"\d\Z", text) and "#" not in text.splitlines()[-1]:
         raise InputError(f"{path}: {_CUT}")
+    if isinstance(content, str) and "\0" in content:
+        raise InputError(f"{path}: {key} has a null character (\\u0000), which no name has. Type it again.")
+    if isinstance(content, dict):
+        for name, value in content.items():
+            refuse_damaged_toml(path, "", value, name)
+    if isinstance(content, list):
+        for value in content:
+            refuse_damaged_toml(path, "", value, key)

@@ -13,7 +13,7 @@ from dvc.errors import ExtentError, InputError
 from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import read_json
-from dvc.tables import refuse_half_a_number
+from dvc.tables import refuse_damaged_toml
 from mrstrain.models.variant_files import VariantFolder
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import matrix_of, read_matrix
@@ -246,7 +246,7 @@ def _settings(place: Path) -> dict[str, Any]:
         content = tomllib.loads(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{settings} is not a valid TOML file ({error}).") from error
-    refuse_half_a_number(settings, text)
+    refuse_damaged_toml(settings, text, content)
     return content
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dvc.errors import InputError
-from dvc.tables import refuse_half_a_number
+from dvc.tables import refuse_damaged_toml
 from mrstrain.options.model import Options, Real
 
 VARIANT = "variant.toml"
@@ -74,7 +74,7 @@ def _read(file: Path) -> VariantRecord:
         content: dict[str, Any] = tomllib.loads(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a valid TOML file ({error}).") from error
-    refuse_half_a_number(file, text)
+    refuse_damaged_toml(file, text, content)
     try:
         record = VariantRecord.of(content)
     except InputError as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dvc.errors import InputError
-from dvc.tables import read_table, refuse_half_a_line, refuse_half_a_number
+from dvc.tables import read_table, refuse_damaged_toml, refuse_half_a_line
 
 
 def test_cells_have_their_line_and_no_blanks(tmp_path: Path) -> None:
@@ -49,6 +49,12 @@ def test_a_file_that_ends_within_a_line_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("whole", ["", "a = 1\n", "a = 1 # of 2", 'a = "1"', "a = [1]", "a = true", "# 1"])
 def test_a_toml_file_that_ends_within_a_number_is_refused(whole: str) -> None:
-    refuse_half_a_number("a.toml", whole)
+    refuse_damaged_toml("a.toml", whole, {})
     with pytest.raises(InputError, match=r"a\.toml: the file may be incomplete: it ends in the middle of a line"):
-        refuse_half_a_number("a.toml", f"{whole}\nb = 14")
+        refuse_damaged_toml("a.toml", f"{whole}\nb = 14", {})
+
+
+def test_a_toml_file_with_a_null_character_is_refused() -> None:
+    content = {"a": {"b": ["x", "y\0"]}}
+    with pytest.raises(InputError, match=r"a\.toml: b has a null character"):
+        refuse_damaged_toml("a.toml", "", content)
