@@ -35,10 +35,14 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what a process that was killed had begun to write into a folder with `whole_file`."""
+    """Remove what a process that has ended had begun to write into a folder with `whole_file`, if there is one."""
+    import psutil
+
     for part in folder.glob(".*.partial.*"):
-        with suppress(OSError):
-            part.unlink()
+        number = part.name.split(".")[1]
+        if number.isdecimal() and not psutil.pid_exists(int(number)):
+            with suppress(OSError):
+                part.unlink()
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -14,6 +14,7 @@ from types import MappingProxyType
 
 from dvc.errors import InputError
 from dvc.file_names import refuse_as_file_name
+from dvc.tables import refuse_damaged_toml
 from fe.hyperelastic import OGDEN
 from fe.materials import MODES, Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 
@@ -241,6 +242,7 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as failure:
         raise InputError(f"{where}: not a TOML file: {failure}.") from failure
+    refuse_damaged_toml(where, text, tables)
     sets = {}
     for name, content in tables.items():
         if not isinstance(content, dict):

@@ -315,6 +315,13 @@ def _autocorrelation(
             field[at] = component
             every = field[::_STRIDE, ::_STRIDE, ::_STRIDE]
             along = [np.moveaxis(every, axis, 0) for axis in axes]
-            found[number] += [np.mean([np.nanmean(f[lag:] * f[:-lag]) for f in along]) for lag in range(1, _LAGS + 1)]
+            found[number] += [_mean_product(along, lag) for lag in range(1, _LAGS + 1)]
         found[number] /= np.mean(remaining**2, axis=0).sum()
     return found, _STRIDE * float(spacing.max()) * np.arange(1.0, _LAGS + 1.0)
+
+
+def _mean_product(fields: list[Float32Array], lag: int) -> float:
+    """Mean product of values so far apart along the first axis, over the fields that have any; NaN if none has."""
+    products = [field[lag:] * field[:-lag] for field in fields]
+    means = [np.nanmean(product) for product in products if np.isfinite(product).any()]
+    return float(np.mean(means)) if means else np.nan

@@ -49,6 +49,12 @@ def is_gone(process: int) -> bool:
         return True
 
 
+def ended_process() -> int:
+    """The number of a process that has ended."""
+    with Popen([sys.executable, "-c", ""]) as process:
+        return process.pid
+
+
 @contextmanager
 def tasks_run_here() -> Iterator[None]:
     """Tasks of workers run in this process, one at a time: one of their own costs two seconds of imports for each."""

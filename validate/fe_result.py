@@ -19,8 +19,8 @@ from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
 from dvc.own_files import read_json
-from dvc.tables import read_table, refuse_half_a_line
-from validate.rigid_parts import without_rigid_parts
+from dvc.tables import read_table
+from validate.rigid_parts import without_named_parts, without_rigid_parts
 from validate.sensitivity import Variant
 from validate.tetrahedra import linear_tetrahedra
 
@@ -77,7 +77,7 @@ class FeResult:
 
 def read_result(
     name: str, path: Path | str, *, mesh: Path | str | None = None, unit: str = "mm", frame: str = "LPS",
-    to_image: FloatArray | None = None,
+    to_image: FloatArray | None = None, leave_out: Sequence[str] = (),
 ) -> FeResult:  # fmt: skip
     """Read the result of any code for one load; displacement is relative to the bone, which does not move.
 
@@ -97,11 +97,14 @@ def read_result(
     to_image : (4, 4), optional
         Rigid map of the model's frame to the image's, LPS mm, applied after unit and frame; it also rotates the
         displacement.
+    leave_out : sequence of str
+        Regions of the file that are no tissue, such as a plate. Rigid ones are left out without being named.
 
     Raises
     ------
     InputError
-        If there is no displacement, it is missing at a node, or it is implausibly large for tissue.
+        If there is no displacement, it is missing at a node, or it is implausibly large for tissue; if a region to
+        leave out is not there, or nothing else is.
     ImageFileError, GeometryError
         As `dvc.io.meshes.read.read_mesh`.
     """
@@ -135,6 +138,11 @@ def read_result(
     names = _names_of_regions(place)
     regions = {names.get(region, region): cells for region, cells in tets.regions.items()}
     tets = TetMesh(rigid.apply(tets.points_mm), tets.cells, regions, tets.facets, tets.node_ids)
+    if leave_out:
+        try:
+            tets, moved = without_named_parts(tets, moved, leave_out)
+        except InputError as error:
+            raise InputError(f"{place}: {error}") from error
     tets, moved, rigid_parts = without_rigid_parts(tets, moved)
     return FeResult(name, place, OnMesh(tets, moved), rigid_parts)
 
@@ -194,7 +202,6 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
 
 def _from_table(place: Path, source: MeshFile) -> FloatArray:
     head, rows = read_table(place)
-    refuse_half_a_line(place)
     named = [cell.strip(" '\"") for cell in head]
     node = next((n for n in _NODE_COLUMNS if n in named), None)
     parts = next((c for c in _COMPONENTS if set(c) <= set(named)), None)

@@ -1,11 +1,14 @@
-"""Parts of a model that move as rigid bodies, such as a plate in the same file: no tissue, and not compared."""
+"""Parts of a model that are no tissue, such as a plate in the same file: named, or found as they are rigid."""
+
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
-from dvc.arrays import FloatArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.nodal import OnMesh
+from dvc.errors import InputError
 
 _MOVED_MM = 0.05  # tissue that is not loaded hardly moves
 _ROUNDED = 1e-5  # of the largest displacement: what the digits of a file leave
@@ -24,21 +27,39 @@ def without_rigid_parts(mesh: TetMesh, u_mm: FloatArray) -> tuple[TetMesh, Float
     rigid = tuple(name for name, at in nodes.items() if _moves_as_one(mesh.points_mm[at], u_mm[at], rounded))
     if not rigid or not _strained(mesh, u_mm):
         return mesh, u_mm, ()
-    kept = np.ones(len(mesh.cells), dtype=bool)
-    kept[np.concatenate([mesh.regions[name] for name in rigid])] = False
+    kept = _all_but(mesh, rigid)
+    return (*_part(mesh, u_mm, kept), rigid) if kept.any() else (mesh, u_mm, ())
+
+
+def without_named_parts(mesh: TetMesh, u_mm: FloatArray, names: Sequence[str]) -> tuple[TetMesh, FloatArray]:
+    """A mesh and its nodes' displacement (n, 3) without the regions of these names, in any case.
+
+    InputError if there is no such region, or nothing else.
+    """
+    known = {name.casefold(): name for name in mesh.regions}
+    if unknown := [name for name in names if name.casefold() not in known]:
+        raise InputError(f"there is no region '{unknown[0]}' to leave out; the regions are {', '.join(mesh.regions)}.")
+    kept = _all_but(mesh, [known[name.casefold()] for name in names])
     if not kept.any():
-        return mesh, u_mm, ()
+        raise InputError("all regions are left out (leave_out), so nothing is compared. Keep those of tissue.")
+    return _part(mesh, u_mm, kept)
+
+
+def _all_but(mesh: TetMesh, names: Collection[str]) -> BoolArray:
+    kept = np.ones(len(mesh.cells), dtype=bool)
+    for name in names:
+        kept[mesh.regions[name]] = False
+    return kept
+
+
+def _part(mesh: TetMesh, u_mm: FloatArray, kept: BoolArray) -> tuple[TetMesh, FloatArray]:
     used, cell = np.unique(mesh.cells[kept]), np.cumsum(kept) - 1
     node = np.full(len(mesh.points_mm), -1)
     node[used] = np.arange(len(used))
     regions = {name: cell[cells[kept[cells]]] for name, cells in mesh.regions.items() if kept[cells].any()}
     facets = {name: node[faces[(node[faces] >= 0).all(axis=1)]] for name, faces in mesh.facets.items()}
     facets = {name: faces for name, faces in facets.items() if len(faces)}
-    return (
-        TetMesh(mesh.points_mm[used], node[mesh.cells[kept]], regions, facets, mesh.node_ids[used]),
-        u_mm[used],
-        rigid,
-    )
+    return TetMesh(mesh.points_mm[used], node[mesh.cells[kept]], regions, facets, mesh.node_ids[used]), u_mm[used]
 
 
 def _strained(mesh: TetMesh, u_mm: FloatArray) -> bool:

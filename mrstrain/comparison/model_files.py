@@ -13,6 +13,7 @@ from dvc.errors import ExtentError, InputError
 from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import read_json
+from dvc.tables import refuse_damaged_toml
 from mrstrain.models.variant_files import VariantFolder
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import matrix_of, read_matrix
@@ -22,7 +23,8 @@ from validate.run_end import early_end
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
 SETTINGS = "model.toml"
-"""File in the folder of a model with the mesh, unit, frame and to_image of this model only."""
+"""File in the folder of a model with the mesh, unit, frame, to_image and leave_out of this model only."""
+_KEYS = ("mesh", "unit", "frame", "to_image", "leave_out")
 
 IN_IMAGE = 'unit = "mm"\nframe = "LPS"\nto_image = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n'
 """Settings of results that are already in the coordinates of the image."""
@@ -66,8 +68,11 @@ class ModelFile:
         return self._read().deformation
 
     def _read(self) -> FeResult:
-        mesh, unit, frame = self.reading.model_mesh, self.reading.model_unit, self.reading.model_frame
-        return read_result(self.name, self.path, mesh=mesh, unit=unit, frame=frame, to_image=self.to_image)
+        how = self.reading
+        return read_result(
+            self.name, self.path, mesh=how.model_mesh, unit=how.model_unit, frame=how.model_frame,
+            to_image=self.to_image, leave_out=how.leave_out,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,10 +239,15 @@ def _folder(place: Path) -> Path:
 def _settings(place: Path) -> dict[str, Any]:
     """The settings of a model; empty if there are none."""
     settings = _folder(place) / SETTINGS
+    if not settings.is_file():
+        return {}
     try:
-        return tomllib.loads(settings.read_text(encoding="utf-8")) if settings.is_file() else {}
+        text = settings.read_text(encoding="utf-8")
+        content = tomllib.loads(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{settings} is not a valid TOML file ({error}).") from error
+    refuse_damaged_toml(settings, text, content)
+    return content
 
 
 def _reading(
@@ -245,11 +255,16 @@ def _reading(
 ) -> tuple[ModelReading, FloatArray | None]:
     """How a model is read: by its own settings, otherwise as ``usual``."""
     folder, content = _folder(place), _settings(place)
-    if unknown := sorted(set(content) - {"mesh", "unit", "frame", "to_image"}):
-        raise InputError(f"{folder / SETTINGS}: unknown key '{unknown[0]}'; the keys are mesh, unit, frame, to_image.")
+    if unknown := sorted(set(content) - {*_KEYS}):
+        raise InputError(f"{folder / SETTINGS}: unknown key '{unknown[0]}'; the keys are {', '.join(_KEYS)}.")
     own: dict[str, Any] = {f"model_{key}": str(content[key]) for key in ("unit", "frame") if key in content}
     if "mesh" in content:
         own["model_mesh"] = folder / str(content["mesh"])
+    if "leave_out" in content:
+        names = content["leave_out"]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f'{folder / SETTINGS}: leave_out is a list of names of regions, such as ["plate"].')
+        own["leave_out"] = tuple(names)
     if "to_image" in content:
         matrix = content["to_image"]
         named = isinstance(matrix, str)

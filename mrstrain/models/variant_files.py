@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dvc.errors import InputError
+from dvc.tables import refuse_damaged_toml
 from mrstrain.options.model import Options, Real
 
 VARIANT = "variant.toml"
@@ -69,9 +70,11 @@ def variant_folders(places: Iterable[Path]) -> list[VariantFolder]:
 
 def _read(file: Path) -> VariantRecord:
     try:
-        content: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+        text = file.read_text(encoding="utf-8")
+        content: dict[str, Any] = tomllib.loads(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a valid TOML file ({error}).") from error
+    refuse_damaged_toml(file, text, content)
     try:
         record = VariantRecord.of(content)
     except InputError as error:

@@ -171,6 +171,8 @@ class ModelReading(Options):
     """Unit of the model coordinates."""
     model_frame: Frame = "LPS"
     """Frame of the model coordinates."""
+    leave_out: Names = ()
+    """Name of a region of the models that is no tissue, such as a plate; rigid regions are left out anyway."""
     unfinished: Flag = False
     """Also compare results of FEBio and CalculiX whose run ended early."""
 

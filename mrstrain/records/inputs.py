@@ -11,6 +11,7 @@ from filelock import FileLock, Timeout
 
 from dvc import Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
 from dvc.arrays import FloatArray
+from dvc.atomic_files import remove_partial
 from dvc.errors import InputError, OutputError
 from dvc.file_names import clash, refuse_as_file_name
 from dvc.io.images.write import refuse_overwriting_inputs
@@ -149,7 +150,7 @@ def alone(out: Path, lock: Path | None = None) -> Iterator[None]:
     """Refuse what another run writes to at the same time: OutputError that names ``out``.
 
     The ``lock`` is a file, by default in the folder ``out``, that is removed with the block. The operating system
-    releases it when the process ends, even by a kill.
+    releases it when the process ends, even by a kill. Files that a killed run had begun to write are removed first.
     """
     place = lock or out / _LOCK
     held = FileLock(place)
@@ -158,6 +159,8 @@ def alone(out: Path, lock: Path | None = None) -> Iterator[None]:
     except Timeout as taken:
         raise OutputError(f"{out}: another run writes to it. Wait until it ends, or choose another (out).") from taken
     try:
+        for folder in {out, place.parent}:
+            remove_partial(folder)
         yield
     finally:
         with suppress(OSError):  # where an open file cannot be removed

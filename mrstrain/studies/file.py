@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from dvc.errors import InputError
 from dvc.file_names import as_file_name, clash, one_spelling
 from dvc.io.result_folder import REPEAT
+from dvc.tables import refuse_damaged_toml
 from mrstrain.options import modelling
 from mrstrain.options.acquisition import AcquisitionOptions
 from mrstrain.options.credibility import CredibilityOptions
@@ -267,6 +268,7 @@ def read_study(path: Path | str | Study) -> Study:
         raise InputError("\n  ".join([f"{place} is not valid TOML:", *_faults(text.splitlines())])) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{place} cannot be read as a TOML file ({error}).") from error
+    refuse_damaged_toml(place, text, told)
     if "place" in told:
         raise InputError(f"{place}: unknown key 'place'; paths are always relative to the folder of the study file.")
     lines = _lines_of(text)

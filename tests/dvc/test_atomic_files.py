@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
 
-from dvc.atomic_files import whole_folder
+from dvc.atomic_files import remove_partial, whole_folder
 from dvc.errors import OutputError
+from tests.processes import ended_process
 
 
 @pytest.fixture
@@ -74,3 +76,16 @@ def test_folders_that_a_killed_process_left_go_with_the_next(tmp_path: Path) -> 
     with whole_folder(final) as part:
         (part / "displacement.nii.gz").write_text("whole")
     assert {path.name for path in tmp_path.iterdir()} == {"Load1", *beside}
+
+
+def test_files_begun_by_a_process_that_is_gone_are_removed_and_all_others_stay(tmp_path: Path) -> None:
+    names = [
+        f".{ended_process()}.partial.report.html",
+        f".{os.getpid()}.partial.report.html",
+        ".x.partial.a.csv",
+        "report.html",
+    ]
+    for name in names:
+        (tmp_path / name).write_text("half")
+    remove_partial(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(names[1:])

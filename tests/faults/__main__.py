@@ -31,6 +31,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTEST = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+PYTEST += ["--ignore", "tests/faults"]  # which sees every fault
 SUITES = {"short": ["-m", "not full_size"], "all": []}
 """What pytest gets beside for the tests of `make test`, and for those of `make test-all`."""
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh, read_mesh
-from dvc.errors import ImageFileError, MrstrainError
+from dvc.errors import ImageFileError, InputError, MrstrainError
 from tests.blocks import block
 from validate import read_result
 from validate.rigid_parts import without_rigid_parts
@@ -170,6 +170,21 @@ def test_rigid_parts_are_those_that_moved(digits: int | None) -> None:
     np.testing.assert_array_equal(moved, u[: 2 * nodes])
     np.testing.assert_array_equal(kept.points_mm, points[: 2 * nodes])
     assert without_rigid_parts(mesh, np.full_like(points, 3.0))[2] == ()  # all of it moves as one: not loaded
+
+
+def test_parts_are_left_out_by_name(folder: Path) -> None:
+    """A plate that deforms is not known to be one."""
+    place = folder / "febio/rigid.xplt"
+    (plate,) = read_result("model", place).rigid_parts
+    found = read_result("model", place, leave_out=[plate.upper()])
+    assert found.rigid_parts == ()
+    assert plate not in found.mesh.regions
+    alone = read_result("model", folder / "febio/hex8.xplt")
+    assert len(found.mesh.cells) == len(alone.mesh.cells)
+    with pytest.raises(InputError, match=rf"rigid\.xplt: there is no region 'plaet' to leave out; .*{plate}"):
+        read_result("model", place, leave_out=["plaet"])
+    with pytest.raises(InputError, match=r"rigid\.xplt: all regions are left out"):
+        read_result("model", place, leave_out=[plate, *found.mesh.regions])
 
 
 @pytest.mark.parametrize(

@@ -54,3 +54,19 @@ def test_of_two_results_of_one_load_it_is_said_which_is_compared(tmp_path: Path)
     assert [files[load][0].path.name for load in LOADS] == ["Load1.vtu", "Load2.xplt"]
     (note,) = notes
     assert note == "mine: Load1.vtu is compared, Load1.xplt is not. To compare it, move it to another folder."
+
+
+def test_a_model_names_the_parts_that_are_no_tissue(tmp_path: Path) -> None:
+    place = model(tmp_path / "mine", Load1="febio/rigid")
+
+    def regions() -> set[str]:
+        files, _ = model_files(["Load1"], [place], ModelReading())
+        return set(files["Load1"][0].deformation().mesh.regions)
+
+    (tissue,) = regions()
+    (place / "model.toml").write_text(f'leave_out = ["{tissue}"]\n')
+    (plate,) = regions()
+    assert plate != tissue
+    (place / "model.toml").write_text('leave_out = "plate"\n')
+    with pytest.raises(InputError, match=r"model\.toml: leave_out is a list of names of regions"):
+        regions()

@@ -226,7 +226,7 @@ def study_with(folder: Path, table: str, more: dict[str, object]) -> Study:
         "\n".join([f"[{name}]", *(f"{key} = {toml(value)}" for key, value in of.items())])
         for name, of in tables.items()
     )
-    (folder / "study.toml").write_text(text)
+    (folder / "study.toml").write_text(text + "\n")
     for name in ("set.toml", "name.toml"):
         (folder / name).write_text(SET)
     return read_study(folder)

@@ -13,8 +13,10 @@ import mrstrain
 from dvc.errors import OutputError, RegistrationError
 from fe import LoadStep
 from mrstrain.measurement.register import register
+from mrstrain.records.inputs import alone
 from tests.golden.scenes import GIVEN
 from tests.phantoms.test_error_tables import CASE, samples
+from tests.processes import ended_process
 
 LOAD0, LOAD1, PAD, LABELS = (GIVEN / name for name in ("Load0.nii.gz", "Load1.nii.gz", "pad.inp", "tissues.nii.gz"))
 NAMED = {"labels": LABELS, "names": GIVEN / "tissues.csv"}
@@ -71,6 +73,16 @@ def test_a_second_run_is_refused_and_writes_nothing(
         second(made, tmp_path)
     written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     assert written <= {held, "study.toml"}
+
+
+@pytest.mark.parametrize("lock", [LOCK, ".study/lock"])
+def test_what_a_killed_run_had_begun_to_write_goes_with_the_next(tmp_path: Path, lock: str) -> None:
+    places = [tmp_path, (tmp_path / lock).parent]
+    (tmp_path / lock).parent.mkdir(exist_ok=True)
+    for place in places:
+        (place / f".{ended_process()}.partial.report.html").write_text("half")
+    with alone(tmp_path, tmp_path / lock):
+        assert not [*tmp_path.rglob("*.partial.*")]
 
 
 def test_the_sets_of_a_study_are_driven_side_by_side(made: Path, tmp_path: Path) -> None:

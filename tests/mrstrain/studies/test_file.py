@@ -75,6 +75,7 @@ def test_everything_wrong_is_told_at_once_with_the_nearest_key(tmp_path):
         ('name = "Heel"', 'name = "Heel"\nout = "/tmp/elsewhere"', "is not below the folder of the study"),
         ('name = "Heel"', 'name = "Heel"\nout = "."', "is not below the folder of the study"),
         ('name = "Heel"', 'name = "Heel"\nseed = 0', "seed"),
+        ("tissues.nii.gz", "tissues\\u0000.nii.gz", r"labels has a null character \(\\u0000\)"),
         ("tissues.nii.gz", "auto", "needs 'bone_mask', the mask of the bone, or 'marks'"),
         ('"tissues.nii.gz"', '"auto"\nmarks = "m.nii.gz"\nnames = "n.csv"', "'names' is not for labels"),
         ('"tissues.nii.gz"', '"auto"\nmarks = "m.nii.gz"\nallow_missing = true', "without missing voxels"),

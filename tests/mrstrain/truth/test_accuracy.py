@@ -109,8 +109,8 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     assert float(nearest["max_shear_rmse"]) > 0.0
 
 
-def test_a_perfect_registration_has_no_error_and_resolves_the_wave(monkeypatch: pytest.MonkeyPatch) -> None:
-    case = replace(CASE, preset="gauss-newton", motion="wave-24")
+def perfectly_registered(case: AccuracyCase, monkeypatch: pytest.MonkeyPatch) -> ErrorSamples:
+    """A run of a shear wave whose registration finds the true displacement."""
     wave = motion_named(Heel(case.seed), case.motion)
 
     def perfect(reference: Image, loaded: Image, **given: Any) -> Registration:
@@ -122,12 +122,25 @@ def test_a_perfect_registration_has_no_error_and_resolves_the_wave(monkeypatch: 
         )
 
     monkeypatch.setattr("phantoms.accuracy_run.register", perfect)
-    run = measure_run(case, SimpleNamespace(threads=1), nullcontext(), lambda _: None)  # type: ignore[arg-type]
+    return measure_run(case, SimpleNamespace(threads=1), nullcontext(), lambda _: None)  # type: ignore[arg-type]
+
+
+def test_a_perfect_registration_has_no_error_and_resolves_the_wave(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = perfectly_registered(replace(CASE, preset="gauss-newton", motion="wave-24"), monkeypatch)
     assert np.ptp(run.true_shear) > 0.05
     assert np.ptp(run.true_slope) > 0.1
     np.testing.assert_allclose(run.u_error_mm, 0.0, atol=0.02)
     np.testing.assert_allclose(run.shear, run.true_shear, atol=0.01)
     np.testing.assert_allclose(run.slope, run.true_slope, atol=0.02)
+
+
+def test_distances_longer_than_the_tissue_along_one_axis_are_taken_along_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = replace(CASE, preset="gauss-newton", motion="wave-24", spacing_mm=(4.0, 4.0, 4.0))
+    run = perfectly_registered(case, monkeypatch)
+    assert run.lag_mm[-1] == 64.0  # no longer than the heel along one axis at least
+    assert np.isfinite(run.correlation).all()
 
 
 def test_what_cannot_be_studied_is_refused_before_anything_runs(
