@@ -10,6 +10,7 @@ import numpy as np
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
+from dvc.images.image import Grid, Mask
 from dvc.measurement.subject import Subject, is_bones_name
 from dvc.registration.register import Registration
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, Uncertainty, to_surface_mm, uncertainty_of
@@ -83,7 +84,7 @@ def error_bars(
         again = None if twin is None else twin.max_shear
         rows = () if again is None else judged(maps.max_shear, again, regions)
         return ErrorBars(None, str(reason), twin=rows, of_twin=_of_twin(rows, twin))
-    to_bone, seed, rows = to_surface_mm(bone, grid.spacing_mm), found.settings.seed, tuple[Judged, ...]()
+    to_bone, seed, rows = _to_bone_mm(bone, regions, grid), found.settings.seed, tuple[Judged, ...]()
     if twin is not None and twin.max_shear is not None:
         again = np.where(np.isfinite(maps.max_shear), twin.max_shear, np.float32(np.nan))
         of_twin = uncertainty_of(again, grid, regions, to_bone, table, seed=seed)
@@ -99,6 +100,14 @@ def error_bars(
         f"soft tissue. {_held(table)} The model applies to tissue that is strained and imaged like these phantoms."
     )
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
+
+
+def _to_bone_mm(bone: BoolArray, tissues: Mapping[str, BoolArray], grid: Grid) -> Float32Array:
+    """Distance (mm) to bone in the tissues; infinite beyond the box of both, which may be a third of the image."""
+    box = Mask(grid, np.logical_or.reduce([bone, *tissues.values()])).box(1)
+    distance = np.full(grid.shape, np.inf, dtype=np.float32)
+    distance[box] = to_surface_mm(bone[box], grid.spacing_mm)
+    return distance
 
 
 def _used(chosen: ErrorModel, table: ErrorTable, wider: Mapping[str, float]) -> ErrorModel:
