@@ -4,6 +4,7 @@ The gradient is the analytic derivative of the spline, not a difference of sampl
 has no error of its own from the sampling of the image.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,13 +14,13 @@ from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.compiled import njit
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid
-from dvc.images.interpolation import Four, Weights, indices_around, spline_basis
+from dvc.images.interpolation import indices_around, spline_basis
 from dvc.threads import in_parts
 
 _SUPPORT = 4
 # Lengths in control spacings: how far a voxel may lie from the place that the separable way gives it, and how
 # close to a face of the valid region a point lies on it (so that the ways agree there in spite of rounding).
-_ALIGNED_INDEX = 1e-6
+ALIGNED_INDEX = 1e-6
 _ON_FACE = 1e-9
 
 Axis = tuple[IntArray, FloatArray, FloatArray]
@@ -115,7 +116,7 @@ class BSpline:
         where = frozen(where, np.bool_)
         if where.shape != grid.shape:
             raise InputError(f"The mask 'where' has shape {where.shape}, but the grid {grid.shape}.")
-        placed = self._axis_indices(grid)
+        placed = indices_along_axes(self.control, grid)
         if placed is None:
             return self.evaluate(grid.points(where))
         order, along = placed
@@ -129,7 +130,7 @@ class BSpline:
 
     def plus(self, other: Self) -> Self:
         """Add two displacements: u(X) = u_1(X) + u_2(X); GeometryError if their control grids differ."""
-        if not self.control.same_as(other.control, tolerance_voxels=_ALIGNED_INDEX):
+        if not self.control.same_as(other.control, tolerance_voxels=ALIGNED_INDEX):
             grids = (self.control, other.control)
             both = [f"{g.shape} points every {g.spacing_mm.round(4)} mm from {g.origin_mm.round(4)}" for g in grids]
             raise GeometryError(
@@ -138,21 +139,22 @@ class BSpline:
             )
         return type(self)(self.control, self.coefficients_mm + other.coefficients_mm)
 
-    def _axis_indices(self, grid: Grid) -> tuple[IntArray, list[FloatArray]] | None:
-        """The control axis of each grid axis, and the control indices along it; None if askew."""
-        closeness = np.abs(self.control.direction.T @ grid.direction)
-        order = closeness.argmax(axis=0)
-        if sorted(order) != [0, 1, 2]:
-            return None
-        start = self.control.indices_of(grid.origin_mm)
-        steps = self.control.indices_of(grid.points_at(np.eye(3))) - start  # row a: one voxel further along axis a
-        along = [start[p] + steps[a, p] * np.arange(grid.shape[a]) for a, p in enumerate(order)]
-        ends = np.array(list(np.ndindex(2, 2, 2)))
-        true = self.control.indices_of(grid.points_at(ends * (np.array(grid.shape) - 1.0)))
-        separable = np.stack([along[a][-ends[:, a]] for a in range(3)], axis=1)
-        if np.abs(true[:, order] - separable).max() > _ALIGNED_INDEX:
-            return None
-        return order, along
+
+def indices_along_axes(of: Grid, grid: Grid) -> tuple[IntArray, list[FloatArray]] | None:
+    """For each axis of ``grid`` the axis of another grid along it, and its voxels' indices there; None if askew."""
+    closeness = np.abs(of.direction.T @ grid.direction)
+    order = closeness.argmax(axis=0)
+    if sorted(order) != [0, 1, 2]:
+        return None
+    start = of.indices_of(grid.origin_mm)
+    steps = of.indices_of(grid.points_at(np.eye(3))) - start  # row a: one voxel further along axis a
+    along = [start[p] + steps[a, p] * np.arange(grid.shape[a]) for a, p in enumerate(order)]
+    ends = np.array(list(np.ndindex(2, 2, 2)))
+    true = of.indices_of(grid.points_at(ends * (np.array(grid.shape) - 1.0)))
+    separable = np.stack([along[a][-ends[:, a]] for a in range(3)], axis=1)
+    if np.abs(true[:, order] - separable).max() > ALIGNED_INDEX:
+        return None
+    return order, along
 
 
 def evaluate_spline(
@@ -173,16 +175,16 @@ def evaluate_spline(
 
 @njit(cache=True)
 def summed_spline(
-    coefficients: FloatArray, at: tuple[Four, Four, Four], value: tuple[Weights, Weights, Weights],
-    slope: tuple[Weights, Weights, Weights],
+    coefficients: FloatArray, at: Sequence[Sequence[int]], value: Sequence[Sequence[float]],
+    slope: Sequence[Sequence[float]],
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """The sum of 4 x 4 x 4 coefficients by their weights along each axis, and its slopes along these."""
+    """The sum of 4 x 4 x 4 coefficients, or fewer, by their weights along each axis, and its slopes along these."""
     total, by_x, by_y, by_z = 0.0, 0.0, 0.0, 0.0
-    for p in range(4):
+    for p in range(len(at[0])):
         plane, plane_y, plane_z = 0.0, 0.0, 0.0
-        for q in range(4):
+        for q in range(len(at[1])):
             line, line_z = 0.0, 0.0
-            for r in range(4):
+            for r in range(len(at[2])):
                 coefficient = coefficients[at[0][p], at[1][q], at[2][r]]
                 line += value[2][r] * coefficient
                 line_z += slope[2][r] * coefficient

@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, spline_filter
 from dvc import threads
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.compiled import njit
-from dvc.deformation.bspline import BSpline, evaluate_spline, summed_spline
+from dvc.deformation.bspline import ALIGNED_INDEX, BSpline, evaluate_spline, indices_along_axes, summed_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
 from dvc.images.depth import NUMBERS as OF_DEPTH, depth_mm
@@ -103,27 +103,45 @@ class Interfaces:
         return self._factors(depth, slope, away, toward, self.own)
 
     def at(self, points_mm: FloatArray, gradient: bool = True) -> FloatArray:
-        """Factors at points (n, 3) LPS mm, (n, 2, 4): of m and psi the value, and the gradient in LPS, or 0 for it."""
+        """Factors at points (n, 3) LPS mm, (n, 2, 4): value and gradient in LPS, or (n, 2, 1) without the gradient."""
         indices = self.grid.indices_of(np.asarray(points_mm, dtype=np.float64))
-        own, depth = np.empty(len(indices), dtype=np.int64), np.empty((2, len(indices)))
-        slope = np.zeros((2, len(indices), 3))
-        given = self.depth, self.own, self.rest, indices, gradient
-        in_parts(_depths_at, len(indices), *given, own, depth, slope)
+        found = _room_for(len(indices), gradient)
+        in_parts(_depths_at, len(indices), self.depth, self.own, self.rest, indices, gradient, *found)
+        return self._of_depths(*found)
+
+    def on_grid(self, grid: Grid, where: BoolArray, gradient: bool = True) -> FloatArray:
+        """Factors at voxels of a grid, as from `at`, in the order of ``np.argwhere(where)``.
+
+        Voxels whose centres are those of the interfaces' own grid, or of its continuation, take a fraction of the time.
+        """
+        placed = indices_along_axes(self.grid, grid)
+        if placed is None or any(np.abs(t - np.rint(t)).max() > ALIGNED_INDEX for t in placed[1]):
+            return self.at(grid.points(where), gradient)
+        order, along = np.argsort(placed[0]), tuple(np.rint(t).astype(np.int64) for t in placed[1])
+        begun = np.concatenate([[0], np.cumsum(np.count_nonzero(where, axis=(1, 2)))])
+        found = _room_for(int(begun[-1]), gradient)
+        given = self.depth, self.own, self.rest, order, along, frozen(where, np.bool_), begun, gradient
+        in_parts(_depths_at_voxels, len(where), *given, *found)
+        return self._of_depths(*found)
+
+    def _of_depths(self, own: IntArray, depth: FloatArray, slope: FloatArray) -> FloatArray:
+        """Factors at points from the depths there; their slopes are by index."""
         slope = slope @ self.grid.index_per_mm
         return self._factors(depth[0], slope[0], -depth[1], -slope[1], own)
 
     def _factors(
         self, depth: FloatArray, slope: FloatArray, away: FloatArray, away_slope: FloatArray, own: IntArray
     ) -> FloatArray:
-        """Factors from depth d and distance b from the bone, and their gradients."""
+        """Factors from depth d and distance b from the bone, and their gradients, if there are slopes."""
         L = self.reach_mm
         m, psi = np.tanh(np.maximum(away, 0.0) / L), L * np.tanh(np.maximum(depth, 0.0) / L)
-        m_slope = ((1.0 - m**2) / L)[..., None] * away_slope
-        psi_slope = (1.0 - (psi / L) ** 2)[..., None] * slope
-        out = np.empty((*m.shape, 2, 4))
+        out = np.empty((*m.shape, 2, 4 if slope.size else 1))
         out[..., 0, 0], out[..., 1, 0] = m, m * psi
-        out[..., 0, 1:] = m_slope
-        out[..., 1, 1:] = m[..., None] * psi_slope + psi[..., None] * m_slope
+        if slope.size:
+            m_slope = ((1.0 - m**2) / L)[..., None] * away_slope
+            psi_slope = (1.0 - (psi / L) ** 2)[..., None] * slope
+            out[..., 0, 1:] = m_slope
+            out[..., 1, 1:] = m[..., None] * psi_slope + psi[..., None] * m_slope
         if self.rest >= 0:
             out[own == self.rest] = 0.0
         return out
@@ -133,6 +151,11 @@ class Interfaces:
         indices = np.argwhere(where).astype(np.float64)
         depth, per_voxel = evaluate_spline(self.depth[number : number + 1], indices, mirror=True)
         return depth[:, 0], per_voxel[:, 0] / self.grid.spacing_mm
+
+
+def _room_for(count: int, gradient: bool) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Arrays for each point's own tissue, its depths (2, n) and their slopes (2, n, 3), or none of these."""
+    return np.empty(count, dtype=np.int64), np.empty((2, count)), np.zeros((2, count if gradient else 0, 3))
 
 
 @njit(nogil=True, cache=True)
@@ -172,6 +195,50 @@ def _depths_at(
             value[1, n], by_x, by_y, by_z = summed_spline(depth[rest], at, (a, b, c), (da, db, dc))
             if gradient:
                 slope[1, n, 0], slope[1, n, 1], slope[1, n, 2] = by_x, by_y, by_z
+
+
+@njit(nogil=True, cache=True)
+def _depths_at_voxels(
+    start: int, stop: int, depth: FloatArray, own: IntArray, rest: int, order: IntArray,
+    along: tuple[IntArray, IntArray, IntArray], where: BoolArray, begun: IntArray, gradient: bool,
+    tissue: IntArray, value: FloatArray, slope: FloatArray,
+) -> None:  # fmt: skip
+    """As `_depths_at`, at whole indices, where splines have three coefficients along each axis.
+
+    ``along`` are the indices of voxels ``where`` (ni, nj, nk), in the order of these axes; ``order`` is the place of
+    each axis of the interfaces among them; ``begun[i]`` voxels lie before the slab i.
+    """
+    shape, (four_values, four_slopes) = own.shape, spline_basis(0.0)
+    v, s = four_values[:3], four_slopes[:3]
+    values, slopes = (v, v, v), (s, s, s)
+    for i in range(start, stop):
+        n = begun[i]
+        for j in range(where.shape[1]):
+            for k in range(where.shape[2]):
+                if not where[i, j, k]:
+                    continue
+                index = along[0][i], along[1][j], along[2][k]
+                x, y, z = index[order[0]], index[order[1]], index[order[2]]
+                at = (
+                    indices_around(x, shape[0])[:3], indices_around(y, shape[1])[:3], indices_around(z, shape[2])[:3],
+                )  # fmt: skip
+                tissue[n], value[:, n] = 0, -np.inf
+                tried = -1
+                for corner in range(8):
+                    number = own[at[0][1 + (corner >> 2)], at[1][1 + (corner >> 1 & 1)], at[2][1 + (corner & 1)]]
+                    if number == tried or (corner and number == tissue[n]):
+                        continue
+                    tried = number
+                    mm, by_x, by_y, by_z = summed_spline(depth[number], at, values, slopes)
+                    if mm > value[0, n]:
+                        tissue[n], value[0, n] = number, mm
+                        if gradient:
+                            slope[0, n, 0], slope[0, n, 1], slope[0, n, 2] = by_x, by_y, by_z
+                if rest >= 0:
+                    value[1, n], by_x, by_y, by_z = summed_spline(depth[rest], at, values, slopes)
+                    if gradient:
+                        slope[1, n, 0], slope[1, n, 1], slope[1, n, 2] = by_x, by_y, by_z
+                n += 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,7 +300,8 @@ class InterfaceSpline:
         u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
         for some in in_chunks(len(points)):
             here = points[some]
-            u[some], H[some] = self._joined(here, self.smooth.evaluate(here), self.jump.evaluate(here))
+            factors = self.borders.at(here)
+            u[some], H[some] = _joined(factors, self.smooth.evaluate(here), self.jump.evaluate(here))
         return u, H
 
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -246,16 +314,24 @@ class InterfaceSpline:
             box = (slice(start, start + step), slice(None), slice(None))
             here, part = grid.part(box), where[box]
             smooth, jump = (spline.evaluate_on_grid(here, part) for spline in (self.smooth, self.jump))
-            found.append(self._joined(here.points(part), smooth, jump))
+            found.append(_joined(self.borders.on_grid(here, part), smooth, jump))
         return np.concatenate([u for u, _ in found]), np.concatenate([H for _, H in found])
 
-    def _joined(
-        self, points: FloatArray, smooth: tuple[FloatArray, FloatArray], jump: tuple[FloatArray, FloatArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Join u and H of both splines at the same points."""
-        u, H = np.empty_like(smooth[0]), np.empty_like(smooth[1])
-        in_parts(_join, len(u), self.borders.at(points), *smooth, *jump, u, H)
-        return u, H
+    def displacement_on_grid(self, grid: Grid) -> FloatArray:
+        """Displacement (n, 3) mm at all voxels of a grid, in their order; much faster than with the gradient."""
+        every = np.ones(grid.shape, dtype=bool)
+        factors = self.borders.on_grid(grid, every, gradient=False)
+        v, w = (spline.evaluate_on_grid(grid, every)[0] for spline in (self.smooth, self.jump))
+        return np.asarray(factors[:, 0] * v + factors[:, 1] * w)
+
+
+def _joined(
+    factors: FloatArray, smooth: tuple[FloatArray, FloatArray], jump: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Join u and H of both splines at the same points."""
+    u, H = np.empty_like(smooth[0]), np.empty_like(smooth[1])
+    in_parts(_join, len(u), factors, *smooth, *jump, u, H)
+    return u, H
 
 
 @njit(nogil=True, cache=True)

@@ -50,6 +50,14 @@ class GridDeformation(Deformation, Protocol):
         """U and H at the voxels of ``grid`` in ``where``, ordered as ``np.argwhere(where)``."""
 
 
+@runtime_checkable
+class GridDisplacement(GridDeformation, Protocol):
+    """A deformation whose displacement alone is found faster still."""
+
+    def displacement_on_grid(self, grid: Grid) -> FloatArray:
+        """U (n, 3) mm at all voxels of ``grid``, in their order."""
+
+
 def in_chunks(count: int) -> Iterator[slice]:
     """The parts of so many points, each of `CHUNK` at the most."""
     return (slice(start, start + CHUNK) for start in range(0, count, CHUNK))
@@ -75,10 +83,14 @@ def evaluate_on_grid(
 def displacement_on_grid(deformation: Deformation, grid: Grid, dtype: type[_T]) -> npt.NDArray[_T]:
     """U (ni, nj, nk, 3) mm at the voxels of a grid, in single or double precision; NaN where not defined."""
     u = np.empty((*grid.shape, 3), dtype)
-    step = max(1, CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: gradients come along
+    step = max(1, CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: gradients come along, as a rule
     for start in range(0, grid.shape[0], step):
         part = grid.part((slice(start, start + step), slice(None), slice(None)))
-        u[start : start + step] = evaluate_on_grid(deformation, part)[0].reshape(*part.shape, 3)
+        if isinstance(deformation, GridDisplacement):
+            found = deformation.displacement_on_grid(part)
+        else:
+            found = evaluate_on_grid(deformation, part)[0]
+        u[start : start + step] = found.reshape(*part.shape, 3)
     return u
 
 

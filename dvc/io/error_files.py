@@ -54,7 +54,8 @@ def write_uncertainty(folder: Path, grid: Grid, sure: Uncertainty, model: ErrorM
         for number, inside in enumerate(sure.regions.values(), start=1):
             numbers[inside] = number
         write_labels(folder / SOFT_TISSUES, LabelMap(grid, numbers, dict(enumerate(sure.regions, start=1))))
-        write_image(folder / TO_BONE, Image(grid, sure.to_bone_mm))
+        known = np.where(np.isfinite(sure.to_bone_mm), sure.to_bone_mm, np.float32(np.nan))
+        write_image(folder / TO_BONE, Image(grid, known))
     if (parts := sure.components) is not None:
         for file, name in _MAPS.items():
             write_image(folder / file, Image(grid, getattr(parts, name)))

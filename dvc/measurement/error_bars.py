@@ -11,6 +11,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
 from dvc.images.depth import to_surface_mm
+from dvc.images.image import Grid, Mask
 from dvc.measurement.subject import Subject, is_bones_name
 from dvc.registration.register import Registration
 from dvc.trust.components import components_of
@@ -98,7 +99,7 @@ def error_bars(
         again = None if twin is None else twin.max_shear
         rows = () if again is None else judged(maps.max_shear, again, regions)
         return ErrorBars(None, str(reason), twin=rows, of_twin=_of_twin(rows, twin))
-    to_bone, seed, rows = to_surface_mm(bone, grid.spacing_mm), found.settings.seed, tuple[Judged, ...]()
+    to_bone, seed, rows = _to_bone_mm(bone, regions, grid), found.settings.seed, tuple[Judged, ...]()
     if twin is not None and twin.max_shear is not None:
         again = np.where(np.isfinite(maps.max_shear), twin.max_shear, np.float32(np.nan))
         of_twin = uncertainty_of(again, grid, regions, to_bone, table, seed=seed)
@@ -120,6 +121,14 @@ def error_bars(
 def _wider(rows: Sequence[Judged]) -> dict[str, float]:
     """Factors on the error bars of tissues that did not hold in the twin."""
     return {row.region: row.factor for row in rows if row.factor is not None and row.factor > 1.0}
+
+
+def _to_bone_mm(bone: BoolArray, tissues: Mapping[str, BoolArray], grid: Grid) -> Float32Array:
+    """Distance (mm) to bone in the tissues; infinite beyond the box of both, which may be a third of the image."""
+    box = Mask(grid, np.logical_or.reduce([bone, *tissues.values()])).box(1)
+    distance = np.full(grid.shape, np.inf, dtype=np.float32)
+    distance[box] = to_surface_mm(bone[box], grid.spacing_mm)
+    return distance
 
 
 def _used(chosen: ErrorModel, table: ErrorTable, wider: Mapping[str, float]) -> ErrorModel:

@@ -92,8 +92,9 @@ def _row(region: str, quantity: str, found: npt.NDArray[np.floating], voxel_ml: 
     if known.size:
         several = known.mean(), known.std(), *np.percentile(known, _PERCENTILES), known.max()
         figures = {name: float(value) for name, value in zip(_NUMBERS, several, strict=True)}
-    thresholds = SHEAR_THRESHOLDS if quantity == "max_shear" else ()
-    above = dict(zip(thresholds, volume_above(known, voxel_ml, thresholds).tolist(), strict=True))
+    above = {}
+    if quantity == "max_shear":
+        above = dict(zip(SHEAR_THRESHOLDS, volume_above(known, voxel_ml, SHEAR_THRESHOLDS).tolist(), strict=True))
     return RegionRow(region, quantity, found.size, found.size * voxel_ml, known.size, **figures, volume_above_ml=above)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from threading import Thread
 
@@ -44,7 +45,7 @@ class Plan:
 
     def register(self, name: str, loaded: Image, start: Deformation | None, worker: Worker, tell: Tell) -> Registered:
         """Register a loaded image, or the repeat scan if its ``name`` is "repeat", and the pair's twin."""
-        Thread(target=lambda: dvc.Measurement, daemon=True).start()  # loaded while the worker is at work
+        Thread(target=_load_what_draws, daemon=True).start()  # while the worker is at work
         is_repeat = name == REPEAT
         of, how = self.subject, self.settings.of_repeat() if is_repeat else self.settings
         found = dvc.register(
@@ -63,6 +64,12 @@ class Plan:
             found, self.subject, evidence, name=folder.name, is_repeat=is_repeat
         )
         return Case.of(measured, folder, {**self.record, **noise_record(measured)}), measured.quality.noise_floor
+
+
+def _load_what_draws() -> None:
+    """Import all that a measurement takes, and what writes its figures as PDF, which matplotlib imports only then."""
+    _ = dvc.Measurement
+    import_module("matplotlib.backends.backend_pdf")
 
 
 def record_of(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.interface_spline import Interfaces, InterfaceSpline
-from dvc.deformation.protocol import Deformation, evaluate_on_grid
+from dvc.deformation.protocol import Deformation, displacement_on_grid, evaluate_on_grid
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io.transforms.interface_spline import read_interface_spline, write_interface_spline
@@ -167,6 +167,39 @@ def test_on_a_grid_it_is_what_it_is_at_points(spline):
     np.testing.assert_allclose(u, true_u, atol=1e-10)
     np.testing.assert_allclose(H, true_H, atol=1e-10)
     assert isinstance(spline, Deformation)
+
+
+@pytest.mark.parametrize("shift_mm", [0.0, 0.4])
+def test_its_displacement_alone_is_found_on_a_grid_without_the_gradient(spline, monkeypatch, shift_mm):
+    grid = GRID.moved_by(np.eye(3), np.full(3, shift_mm))
+    u = spline.evaluate(grid.points().reshape(-1, 3))[0].reshape(*grid.shape, 3)
+    for name in ("evaluate_on_grid", "evaluate"):
+        monkeypatch.setattr(InterfaceSpline, name, lambda *_: pytest.fail("the gradient is computed, too"))
+    np.testing.assert_allclose(displacement_on_grid(spline, grid, np.float64), u, atol=1e-10)
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
+def test_at_voxels_of_the_interfaces_only_three_coefficients_are_summed(spline, monkeypatch, axes):
+    """With axes in another order and direction, and beyond the interfaces' grid: the same numbers as at points."""
+    turn = Rotation.from_rotvec([20.0, -10.0, 30.0], degrees=True).as_matrix()
+    turned = spline.turned(turn)
+    own = turned.borders.grid
+    shape, signs = np.array(GRID.shape)[list(axes)] + 4, np.array([1.0, -1.0, 1.0])
+    columns = own.direction[:, list(axes)] * signs
+    corner = own.centre_mm - columns @ (own.spacing_mm[list(axes)] * (shape - 1) / 2.0)
+    grid = Grid(tuple(shape.tolist()), own.spacing_mm[list(axes)], corner, columns)
+    where = np.random.default_rng(3).uniform(size=grid.shape) < 0.1
+    at = turned.borders.at(grid.points(where))
+    with monkeypatch.context() as patch:
+        patch.delattr(Interfaces, "at")
+        found = turned.borders.on_grid(grid, where)
+    np.testing.assert_allclose(found, at, atol=1e-9)
+    assert np.unique(at[:, 0, 0]).size > 100
+    between = grid.moved_by(np.eye(3), 0.5 * own.spacing_mm[0] * own.direction[:, 0])
+    np.testing.assert_array_equal(turned.borders.on_grid(between, where), turned.borders.at(between.points(where)))
+    for near in (grid, between):
+        alone = turned.borders.on_grid(near, where, gradient=False)
+        np.testing.assert_allclose(alone, turned.borders.at(near.points(where))[..., :1], atol=1e-9)
 
 
 def test_files_with_the_same_borders_share_them_and_no_others_do(spline, borders, tmp_path):

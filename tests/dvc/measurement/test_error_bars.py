@@ -1,0 +1,34 @@
+"""The distance to bone that an error model asks for: computed where it is used, and exact there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from dvc.images.image import Grid
+from dvc.measurement import error_bars
+from dvc.trust.error_model import to_surface_mm
+
+GRID = Grid((40, 36, 30), (0.8, 0.8, 1.6), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_distances_to_bone_are_computed_in_the_box_of_the_body_alone(seed, monkeypatch):
+    random, near = np.random.default_rng(seed), np.zeros(GRID.shape, dtype=bool)
+    near[6:30, 8:27, 0:20] = True
+    rough = gaussian_filter(random.normal(size=GRID.shape), 2.0)
+    bone = near & (rough > 0.06)
+    tissues = {"fat": near & (rough < 0.0), "muscle": near & (rough < 0.03) & (rough >= 0.0)}
+    whole, sizes = to_surface_mm(bone, GRID.spacing_mm), []
+
+    def watched(body: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+        sizes.append(body.size)
+        return to_surface_mm(body, spacing_mm)
+
+    monkeypatch.setattr(error_bars, "to_surface_mm", watched)
+    found = error_bars._to_bone_mm(bone, tissues, GRID)
+    for inside in tissues.values():
+        assert inside.sum() > 500
+        np.testing.assert_array_equal(found[inside], whole[inside])
+    assert sum(sizes) < 0.4 * near.size
