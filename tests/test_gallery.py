@@ -31,7 +31,7 @@ def test_an_example_draws_its_picture(example, tmp_path, monkeypatch, heel_pair_
     try:
         with plt.rc_context():
             runpy.run_path(str(example))
-        assert not [pale for number in plt.get_fignums() for pale in pale_lines(plt.figure(number))]
+            assert not [pale for number in plt.get_fignums() for pale in pale_lines(plt.figure(number))]
     finally:
         plt.close("all")
     picture = tmp_path / f"{example.stem}.webp"
