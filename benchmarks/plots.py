@@ -20,13 +20,17 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+import dvc
 from benchmarks.accuracy_tables import CONDITIONS, USUAL, Results
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
 IMAGES = HERE.parent / "docs" / "images" / "benchmarks"
 TISSUES = ("fat", "muscle", "skin", "bone")
-OURS, LABELS, ELASTIX, OTHERS = "#0b6e99", "#14a37f", "#d9730d", "#9aa5b1"
+plt.style.use(dvc.FIGURE_STYLE)
+OURS, ELASTIX, LABELS = plt.rcParams["axes.prop_cycle"].by_key()["color"][:3]
+OTHERS = "#7d8894"
+MARKERS = {OURS: "o-", ELASTIX: "^-", LABELS: "s-"}
 ENGINES = {
     "gauss-newton": ("default engine", OURS),
     "gauss-newton-borders": ("with a label map", LABELS),
@@ -46,11 +50,9 @@ def read(name: str) -> Any:
 
 def panels(count: int = 1, height: float = 3.2) -> tuple[Figure, list[Axes]]:
     """Plots side by side, without frames."""
-    figure, axes = plt.subplots(1, count, figsize=(9, height), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(1, count, figsize=(9, height), squeeze=False)
     for one in axes.flat:
-        one.spines[["top", "right"]].set_visible(False)
-        one.grid(axis="y", color="#e5e8ec")
-        one.set_axisbelow(True)
+        one.grid(axis="y")
     return figure, list(axes.flat)
 
 
@@ -84,12 +86,12 @@ def error() -> Figure:
         for engine, (label, colour) in ENGINES.items():
             results = Results(RESULTS / "accuracy" / engine)
             values = [results.error(tissue, condition=condition) for condition in CONDITIONS]
-            one.plot(range(3), values[:3], "o-", color=colour, label=label)
-            one.plot((3, 4), values[3:], "o", color=colour)
+            one.plot(range(3), values[:3], MARKERS[colour], color=colour, label=label)
+            one.plot((3, 4), values[3:], MARKERS[colour][0], color=colour)
         one.set(title=tissue, ylim=(0, 0.08))
         one.set_xticks(range(len(names)), names, fontsize=7)
     axes[0].set_ylabel("RMSE of the max. shear")
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].legend(fontsize=8)
     return figure
 
 
@@ -110,7 +112,7 @@ def engines() -> Figure:
         one.set(title=title, ylim=(0, 0.1))
         one.set_xticks(range(len(motions)), motions, fontsize=8)
     axes[0].set_ylabel("RMSE of the max. shear")
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].legend(fontsize=8)
     return figure
 
 
@@ -125,11 +127,11 @@ def resolution() -> Figure:
                 for row in Results(RESULTS / "accuracy" / engine).table("resolution.csv")
                 if (row["voxel_mm"], float(row["snr"])) == USUAL and row["tissue"] == tissue
             )
-            one.plot(*zip(*rows, strict=True), "o-", color=colour, label=label)
+            one.plot(*zip(*rows, strict=True), MARKERS[colour], color=colour, label=label)
         one.axhline(0.9, color="k", linewidth=0.6, linestyle=":")
         one.set(title=tissue, xlabel="wavelength, mm", ylim=(0, 1.1))
     axes[0].set_ylabel("fraction recovered")
-    axes[2].legend(frameon=False, fontsize=8, loc="lower right")
+    axes[2].legend(fontsize=8, loc="lower right")
     return figure
 
 
@@ -140,14 +142,14 @@ def areas() -> Figure:
     for one, load in zip(axes, ("Load1", "Load2", "Load3", "Load4", "all loads"), strict=True):
         for place, name in enumerate(SETS):
             _, estimate, low, high = told["measured_area_ml"][load][name]
-            one.plot((place, place), (low, high), color=OURS, linewidth=5, alpha=0.35, label=None if place else "95 %")
+            one.plot((place, place), (low, high), color=OURS, linewidth=2, label=None if place else "95 %")
             one.plot(place, estimate, "_", color=OURS, markersize=12, label=None if place else "estimated")
             one.plot(place, told["true_area_ml"][load][name], "kx", label=None if place else "true")
         one.set_title(load)
         one.set_ylim(bottom=0)
         one.set_xticks(range(len(SETS)), SETS, rotation=45, fontsize=8)
     axes[0].set_ylabel("area, mL")
-    axes[0].legend(frameon=False, fontsize=7)
+    axes[0].legend(fontsize=7)
     return figure
 
 
@@ -162,9 +164,9 @@ def registration() -> Figure:
             chosen = sorted(
                 (run["voxels"] / 1e6, run[key]) for run in runs if (run["labels"], run["preset"]) == (labels, preset)
             )
-            one.plot(*zip(*chosen, strict=True), "o-", color=colour, label=name)
+            one.plot(*zip(*chosen, strict=True), MARKERS[colour], color=colour, label=name)
         one.set(xlabel="million voxels", ylabel=label, xlim=(0, None), ylim=(0, None))
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].legend(fontsize=8)
     return figure
 
 
@@ -173,7 +175,7 @@ def elements() -> Figure:
     figure, axes = panels(3)
     runs = read("fe_speed")["runs"]
     programs = {
-        "P1": "ours", "tet4": "FEBio\ntet4", "C3D4": "CalculiX\nC3D4", "tet10": "FEBio\ntet10",
+        "P1": "mrstrain", "tet4": "FEBio\ntet4", "C3D4": "CalculiX\nC3D4", "tet10": "FEBio\ntet10",
         "C3D10": "CalculiX\nC3D10",
     }  # fmt: skip
     for place, program in enumerate(programs):
@@ -182,7 +184,7 @@ def elements() -> Figure:
         height = median(seconds) if seconds else given_up[0]
         bar = axes[0].bar(place, height, color=OURS if program == "P1" else OTHERS, hatch="" if seconds else "//")
         force = [run["force_n"] for run in runs if run["program"] == program and run["seconds"]]
-        told = f"{height:.0f} s\n{force[0]:.0f} N" if seconds else "no end"
+        told = f"{height:.0f} s\n{force[0]:.0f} N" if seconds else "no result"
         axes[0].bar_label(bar, [told], fontsize=7)
     axes[0].set(ylabel="one lift, s", ylim=(0, 80))
     axes[0].set_xticks(range(len(programs)), programs.values(), fontsize=6)
@@ -190,9 +192,12 @@ def elements() -> Figure:
         scaling = read(file)
         colour = OURS if file == "fe_scaling" else LABELS
         for one, key, label in zip(axes[1:], ("load_s", "peak_gib"), ("Load1, s", "memory, GiB"), strict=True):
-            one.plot(np.array(scaling["cells"]) / 1000.0, scaling["least"][key], "o-", color=colour, label=name)
-            one.set(xlabel="thousand cells", ylabel=label, xlim=(0, None), ylim=(0, None))
-    axes[1].legend(frameon=False, fontsize=8)
+            thousands = np.array(scaling["cells"]) / 1000.0
+            one.plot(thousands, scaling["least"][key], MARKERS[colour], color=colour, label=name)
+            one.set(xlabel="thousand cells", ylabel=label)
+    for one in axes[1:]:
+        one.set(xlim=(0, None), ylim=(0, None))
+    axes[1].legend(fontsize=8)
     return figure
 
 
@@ -208,7 +213,7 @@ def convergence() -> Figure:
         one.plot(told["sizes_mm"], 100.0 * (np.array(row["values"]) / row["limit"]["limit"] - 1.0), "o-", label=name)
     one.axhline(0.0, color="k", linewidth=0.6)
     one.set(xlabel="size of the cells, mm", ylabel="off the limit, %", xlim=(0, None))
-    one.legend(frameon=False, fontsize=8)
+    one.legend(fontsize=8)
     return figure
 
 

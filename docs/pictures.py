@@ -1,9 +1,8 @@
 """The pictures at the head of the pages, from results of the demonstration and of the tutorials' own tests.
 
     mrstrain demo --out DEMO
-    mrstrain demo --full --out FULL
     python -m pytest tests/test_tutorials.py -o tmp_path_retention_policy=all --basetemp=TUTORIALS
-    python docs/pictures.py DEMO FULL TUTORIALS
+    python docs/pictures.py DEMO TUTORIALS
 
 Pictures of the gallery are made by its examples (docs/gallery.md), those of the benchmarks by benchmarks/plots.py.
 """
@@ -74,8 +73,8 @@ def timeline(log: Path) -> plt.Figure:
     ends = [datetime.fromisoformat(time).timestamp() for time, _, _ in ended]
     took = [float(seconds) for _, _, seconds in ended]
     starts = [end - seconds for end, seconds in zip(ends, took, strict=True)]
-    figure, axes = plt.subplots(figsize=(9, 3), layout="constrained")
-    colours = {"mesh": "tab:gray", "register": "tab:blue", "simulate": "tab:orange", "compare": "tab:green"}
+    figure, axes = plt.subplots(figsize=(9, 3))
+    colours = {"mesh": "C3", "register": "C0", "simulate": "C1", "compare": "C2"}
     order = sorted(range(len(ended)), key=starts.__getitem__, reverse=True)
     for row, n in enumerate(order):
         axes.barh(row, took[n], left=starts[n] - min(starts), color=colours[ended[n][1].split()[0]])
@@ -92,7 +91,7 @@ def phantom_scans() -> plt.Figure:
     tissue = phantoms.labels_of(heel, middle).labels > 0
     true = dvc.strain_maps(motion, dvc.Mask(middle, tissue)).max_shear
     scans = [phantoms.scan(heel, grid, moved, snr=25.0, number=n).values for n, moved in enumerate((None, motion))]
-    figure, axes = plt.subplots(1, 3, figsize=(9, 3.4), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(9, 3.4))
     slices = [*(scan[grid.shape[0] // 2] for scan in scans), true[0]]
     for one, image, title in zip(axes, slices, ("unloaded", "Load1", "true max. shear"), strict=True):
         one.imshow(image.T, origin="lower", cmap="viridis" if title.startswith("true") else "gray")
@@ -118,18 +117,19 @@ def motions() -> plt.Figure:
         "loaded, as scanned: T(X) = T$_b$(X + u)": (moved(unloaded + u), moved(bone)),
         "bone put back: X + u(X)": (unloaded + u, bone),
     }
-    figure, axes = plt.subplots(1, 3, figsize=(9, 2.9), layout="constrained", sharex=True, sharey=True)
+    figure, axes = plt.subplots(1, 3, figsize=(9, 2.9), sharex=True, sharey=True)
     for one, (title, (tissue, bone_there)) in zip(axes, states.items(), strict=True):
         one.fill(*bone_there.T, color="#d9dee4", edgecolor="#4f5b69")
-        one.plot(*np.moveaxis(tissue, -1, 0), *np.moveaxis(tissue.transpose(1, 0, 2), -1, 0), color="#d9730d", lw=0.8)
-        one.plot(*tissue[2, 4], "o", color="#0b6e99")
+        lines = *np.moveaxis(tissue, -1, 0), *np.moveaxis(tissue.transpose(1, 0, 2), -1, 0)
+        one.plot(*lines, color="C1", linestyle="-", linewidth=0.8)
+        one.plot(*tissue[2, 4], "o", color="C0")
         one.set(title=title, aspect="equal")
         one.axis("off")
     axes[1].fill(*bone.T, facecolor="none", edgecolor="#4f5b69", linestyle=":")
     axes[2].annotate(
-        "", unloaded[2, 4] + u[2, 4], unloaded[2, 4], arrowprops={"arrowstyle": "->", "color": "#0b6e99"}
+        "", unloaded[2, 4] + u[2, 4], unloaded[2, 4], arrowprops={"arrowstyle": "->", "color": "C0"}
     )  # fmt: skip
-    axes[2].text(*(unloaded[2, 4] + (1.5, -1.0)), "u", color="#0b6e99")
+    axes[2].text(*(unloaded[2, 4] + (1.5, -1.0)), "u", color="C0")
     axes[0].text(0.0, 18.0, "bone", ha="center")
     return figure
 
@@ -147,10 +147,11 @@ def bed() -> plt.Figure:
 
 def main() -> None:
     """All of them."""
-    demo, full, tutorials = map(Path, sys.argv[1:])
+    demo, tutorials = map(Path, sys.argv[1:])
+    plt.style.use(dvc.FIGURE_STYLE)
     for name, path in DEMO.items():
         save(name, opened(demo / "results" / path))
-    save("strain", opened(full / "results" / DEMO["study"]), 1200)
+    save("strain", opened(demo / "results" / DEMO["study"]), 1200)
     for name, path in TUTORIALS.items():
         save(name, opened(tutorials / path))
     save("cluster", drawn(timeline(demo / "results" / "study.log")))

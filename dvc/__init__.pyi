@@ -35,6 +35,7 @@ from .registration.engine import AlignedPair, Engine
 from .registration.engines import engine_named
 from .registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from .registration.register import Registration, Settings, register
+from .report.style import FIGURE_STYLE
 from .trust.assessment import Similarity, assess
 from .trust.error_model import ErrorModel, ErrorTable, read_error_model
 from .trust.landmarks import read_landmarks, target_registration_error
@@ -42,13 +43,13 @@ from .trust.quality import Quality, noise_floor
 from .trust.verdict import Verdict
 
 __all__ = [
-    "Affine", "AlignedPair", "Alignment", "BSpline", "Composed", "Deformation", "Elastix", "Engine", "ErrorModel",
-    "ErrorTable", "Evidence", "GaussNewton", "GaussNewtonWithInterfaces", "Grid", "Image", "InterfaceSpline",
-    "LabelMap", "Mask", "Measurement", "MeshFile", "Preset", "Quality", "Registration", "RigidMotion",
-    "SampledDisplacement", "Settings", "Similarity", "StrainField", "StrainMaps", "Subject", "TetMesh", "TissueLabels",
-    "Verdict", "Within", "assess", "correct_labels", "engine_named", "errors", "evaluate_on_grid", "fit_mask",
-    "label_tissues", "labels_from", "load_preset", "local_correlation", "measure", "noise_floor", "plate_axes",
-    "preset_names", "principal_values",
+    "FIGURE_STYLE", "Affine", "AlignedPair", "Alignment", "BSpline", "Composed", "Deformation", "Elastix", "Engine",
+    "ErrorModel", "ErrorTable", "Evidence", "GaussNewton", "GaussNewtonWithInterfaces", "Grid", "Image",
+    "InterfaceSpline", "LabelMap", "Mask", "Measurement", "MeshFile", "Preset", "Quality", "Registration",
+    "RigidMotion", "SampledDisplacement", "Settings", "Similarity", "StrainField", "StrainMaps", "Subject", "TetMesh",
+    "TissueLabels", "Verdict", "Within", "assess", "correct_labels", "engine_named", "errors", "evaluate_on_grid",
+    "fit_mask", "label_tissues", "labels_from", "load_preset", "local_correlation", "measure", "noise_floor",
+    "plate_axes", "preset_names", "principal_values",
     "read_displacement", "read_error_model", "read_image", "read_labels", "read_landmarks", "read_mask", "read_mesh",
     "read_parameter_file", "read_transform", "register", "strain_maps", "target_registration_error", "tissue_mask",
     "write_image", "write_labels", "write_mask", "write_vectors",

@@ -37,6 +37,15 @@ def _coarse_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _charts_checked() -> Iterator[None]:
+    """Every chart that is drawn in this process has lines that can be seen on white."""
+    from tests.pictures import charts_checked
+
+    with charts_checked():
+        yield
+
+
 @pytest.fixture
 def real_pictures() -> Iterator[None]:
     """For tests that look at figures."""

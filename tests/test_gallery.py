@@ -10,6 +10,7 @@ from matplotlib import pyplot as plt
 
 import fe
 import phantoms
+from tests.pictures import pale_lines
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLES = sorted((DOCS / "gallery").glob("*.py"))
@@ -28,12 +29,20 @@ def test_an_example_draws_its_picture(example, tmp_path, monkeypatch, heel_pair_
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("agg")
     try:
-        runpy.run_path(str(example))
+        with plt.rc_context():
+            runpy.run_path(str(example))
+            assert not [pale for number in plt.get_fignums() for pale in pale_lines(plt.figure(number))]
     finally:
         plt.close("all")
     picture = tmp_path / f"{example.stem}.webp"
     assert picture.read_bytes()[8:12] == b"WEBP"
     assert picture.stat().st_size < MOST_BYTES
+
+
+def test_examples_draw_in_the_style_of_reports() -> None:
+    for example in (one.read_text() for one in EXAMPLES):
+        assert ("plt." in example) == ("plt.style.use(dvc.FIGURE_STYLE)" in example)
+    assert sum("plt." in one.read_text() for one in EXAMPLES) == 9
 
 
 def test_the_page_shows_every_example_with_its_picture() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -46,3 +48,12 @@ def test_every_picture_says_what_it_shows() -> None:
     told = [(page.name, words) for page in pages for words, _ in PICTURE.findall(page.read_text())]
     assert len(told) > 40
     assert not [one for one in told if len(one[1].split()) < 3]
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *READ, *sorted((DOCS / "reference").glob("*.md"))])
+def test_files_shown_on_a_page_can_be_read_and_lines_are_wrapped_alike(page: Path) -> None:
+    text = page.read_text()
+    for language, block in re.findall(r"^```(toml|json)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        assert {"toml": tomllib.loads, "json": json.loads}[language](block), block
+    links = re.compile(r"\]\([^)]*\)")  # a long address cannot be wrapped
+    assert not [line for line in prose(text) if len(links.sub("]()", line)) > 120]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,3 +35,9 @@ def test_every_claim_names_what_shows_it() -> None:
     assert len(rows) > 30
     assert len(points) > 10
     assert not [claim for claim in (*rows, *points) if not SHOWN.search(claim)]
+
+
+def test_every_seeded_fault_finds_its_line() -> None:
+    listed = tomllib.loads((ROOT / "tests" / "faults" / "faults.toml").read_text())["fault"]
+    assert len(listed) > 40
+    assert not [fault["name"] for fault in listed if (ROOT / fault["file"]).read_text().count(fault["find"]) != 1]

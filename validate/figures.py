@@ -58,7 +58,7 @@ def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], mode
         at = of["measured"].max_shear
         if LOWER in of:
             edges = of[LOWER].volume_above_ml, of[UPPER].volume_above_ml
-            axes.fill_between(at, *edges, color=BAND, linewidth=0, label="95 % band of the true curve")
+            axes.fill_between(at, *edges, **BAND, label="95 % band of the true curve")
         for name in (name for name in ("measured", *models) if name in of):
             how = {"color": "black", "linewidth": 2.4} if name == "measured" else look[name].line
             axes.plot(at, of[name].volume_above_ml, label=name, **how)

@@ -9,6 +9,7 @@ import numpy as np
 from dvc import Deformation, LabelMap, Mask, StrainField, Verdict, evaluate_on_grid
 from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
+from dvc.report.alike import alike
 from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from dvc.report.strips import MEASURED, Strip, strain_by_load
@@ -148,9 +149,10 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     ]
     words += [] if verdict is None else [f"Verdict on the registration: {verdict.words}."]
     curves, slices, *others = (picture for stem, picture in pictures.items() if stem != _COEFFICIENTS)
-    tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
+    tables = _tissues(one), _location(one), _skin(one)
+    doubtful = None if verdict is None or verdict.level == "trust" else verdict
     return [
-        Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
+        Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,), folded=True),
         *validation_section(one.load, one.errors, ALL),
         Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others), folded=True),
         standards.section(one, pictures.get(_COEFFICIENTS)),
@@ -180,14 +182,16 @@ def overview(
     slips = Verdict("caution", tuple(warnings)) if warnings else None
     areas = (_areas(loads, ranking),)
     return Section(
-        "Models and loads", slips, areas, tuple(pictures), (*ranking.statements, *notes), pictures_first=True
+        "Models and loads", slips, areas, tuple(pictures), (*alike(ranking.statements), *notes), pictures_first=True
     )
 
 
 def _head(one: LoadComparison) -> str:
-    """A load's name, with its verdict if that is not trust."""
+    """A load's name, with its verdict if that is not trust, and with what makes its areas useless."""
     verdict = one.case.verdict
-    return one.load if verdict is None or verdict.level == "trust" else f"{one.load} ({verdict.words.lower()})"
+    told = [] if verdict is None or verdict.level == "trust" else [verdict.words.lower()]
+    told += ["not informative"] * one.hardly_strained
+    return f"{one.load} ({', '.join(told)})" if told else one.load
 
 
 def closing_sections(

@@ -40,11 +40,11 @@ def coefficients(decompositions: Mapping[str, Decomposition], models: Sequence[s
         shown = np.concatenate([by.estimate, *of_models.values()])
         line = np.array([shown.min() - by.guide_band, shown.max() + by.guide_band])
         edges = line - by.guide_band, line + by.guide_band
-        axes.fill_between(line, *edges, color=BAND, linewidth=0, label="CWA 16799, 2 u(s)")
+        axes.fill_between(line, *edges, **BAND, label="CWA 16799, 2 u(s)")
         axes.plot(line, line, color=INK, linewidth=0.9)
         for name, values in of_models.items():
             colour = look[name].colour
-            axes.hlines(values, by.estimate - by.band, by.estimate + by.band, color=colour, linewidth=0.6, alpha=0.5)
+            axes.hlines(values, by.estimate - by.band, by.estimate + by.band, color=colour, linewidth=0.6)
             axes.plot(by.estimate, values, **look[name].marked | {"linestyle": "none", "markersize": 3, "label": name})
         axes.set(xlim=line, ylim=line)
         label_axes(axes, "measured coefficient, no unit", "simulated coefficient, no unit", tissue)

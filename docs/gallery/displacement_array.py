@@ -17,6 +17,7 @@ gamma = u[..., 1] * (z - 15.0) / 20.0  # du_y/dz by hand
 exact = np.abs(gamma) / 2.0 * np.sqrt(1.0 + gamma**2 / 4.0)
 assert np.abs(maps.max_shear - exact)[:, :, 2:-2].max() < 0.002
 
+plt.style.use(dvc.FIGURE_STYLE)
 plt.imshow(maps.max_shear[20].T, origin="lower", extent=(0, 40, 0, 30))
 plt.gca().set(xlabel="y, mm", ylabel="z, mm")
 plt.colorbar(label="maximum shear strain")

@@ -20,6 +20,7 @@ held = np.mean(np.abs(error) < 1.96)
 print(f"{held:.0%} of the voxels of fat lie within 1.96 standard deviations")
 assert held > 0.85
 
+plt.style.use(dvc.FIGURE_STYLE)
 plt.hist(error, bins=60, range=(-5, 5), density=True)
 z = np.linspace(-5, 5, 201)
 plt.plot(z, np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi), "k")

@@ -3,8 +3,10 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
+import dvc
 import fe
 
+plt.style.use(dvc.FIGURE_STYLE)
 stretch = np.linspace(0.6, 1.4, 81)
 for name in fe.published_names():
     materials = fe.material_set(name).materials
@@ -19,5 +21,5 @@ print(f"trebbi: {young_kpa:.1f} kPa, three times the shear modulus of {1000.0 * 
 assert abs(young_kpa / (3000.0 * trebbi.shear_modulus_mpa) - 1.0) < 0.001
 
 plt.gca().set(xlabel="stretch", ylabel="nominal stress, kPa", ylim=(-60, 40))
-plt.legend(fontsize=8)
+plt.legend()
 plt.savefig("material_curves.webp")

@@ -3,6 +3,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
+import dvc
 import fe
 import phantoms
 
@@ -18,6 +19,7 @@ for name, cells in mesh.regions.items():
 print(f"smallest dihedral angle {quality.least_angle_deg:.0f} degrees")
 assert quality.least_angle_deg > 5.0
 
+plt.style.use(dvc.FIGURE_STYLE)
 axes = plt.figure().add_subplot(projection="3d")
 for name in ("skin", "bone", "cut"):
     axes.plot_trisurf(*mesh.points_mm.T, triangles=mesh.facets[name], linewidth=0.1, edgecolor="k", alpha=0.8)

@@ -22,6 +22,7 @@ lps = u.TransformIndexToPhysicalPoint([int(i) for i in index])
 print(f"largest max. shear {shear.get_fdata()[index]:.2f} at {ras[:3].round(1)} RAS, {np.round(lps, 1)} LPS")
 assert np.allclose(ras[:3] * [-1, -1, 1], lps, atol=1e-3)
 
+plt.style.use(dvc.FIGURE_STYLE)
 plt.imshow(np.rot90(shear.get_fdata()[index[0]]), vmax=0.6)
 plt.axis("off")
 plt.colorbar(label="maximum shear strain")

@@ -16,8 +16,9 @@ floor, strained = (np.median(max_shear[soft]) for max_shear in (repeat.max_shear
 print(f"max. shear in the median: {floor:.3f} without load, {strained:.3f} under load")
 assert floor < 0.03 < strained
 
+plt.style.use(dvc.FIGURE_STYLE)
 for max_shear, name in ((repeat.max_shear, "unloaded twice, measured"), (loaded.max_shear, "loaded, true")):
-    plt.hist(max_shear[soft], bins=np.linspace(0, 0.3, 61), alpha=0.6, label=name)
+    plt.hist(max_shear[soft], bins=np.linspace(0, 0.3, 61), histtype="step", label=name)
 plt.gca().set(xlabel="maximum shear strain", ylabel="voxels")
 plt.legend()
 plt.savefig("noise_floor.webp")

@@ -22,6 +22,7 @@ u_mm, gradient = model.evaluate(np.column_stack([np.full(y.size, -10.0), y.ravel
 assert np.isclose(u_mm[:, 1].max(), 10.0 * 0.019**2 * 1000.0, atol=0.02)
 
 shear = dvc.StrainField.from_gradient(gradient).max_shear.reshape(y.shape)
+plt.style.use(dvc.FIGURE_STYLE)
 plt.imshow(shear, origin="lower", extent=(-19, -1, 1, 19))
 plt.gca().set(xlabel="P, mm", ylabel="S, mm")
 plt.colorbar(label="maximum shear strain")

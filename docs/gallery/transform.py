@@ -20,6 +20,7 @@ strain = dvc.StrainField.from_gradient(gradient)
 itk = np.array([spline.TransformPoint(point) for point in points.tolist()]) - points
 assert np.abs(u - itk).max() < 1e-9
 
+plt.style.use(dvc.FIGURE_STYLE)
 plt.imshow(strain.max_shear.reshape(77, 77).T, origin="lower", extent=(1, 39, 1, 39))
 plt.gca().set(xlabel="y, mm", ylabel="z, mm")
 plt.colorbar(label="maximum shear strain")

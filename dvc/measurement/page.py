@@ -104,7 +104,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     if quality.similarity is not None:
         each = zip(("as scanned", "after rigid alignment", "after registration"), quality.similarity, strict=True)
         rows += [(f"Local similarity in the tissue, {said}", float(value), "") for said, value in each]
-        rows.append(("Highest local similarity that noise as in the air allows, about", quality.most_similarity, ""))
+        rows.append(("Highest local similarity possible with noise as in the air, about", quality.most_similarity, ""))
     bone = "in the bone, before it was made rigid" if quality.bone_held else "in the bone"
     if held == "bone":
         rows += [

@@ -47,7 +47,8 @@ class LabelsFromImage:
     @property
     def told(self) -> str:
         """A sentence on it."""
-        return f"The label map was made from the image; {100 * self.unsure:.0f} % of its voxels are unsure."
+        share = f"{100 * self.unsure:.0f} %"
+        return f"The label map was made from the image; {share} of its voxels have an uncertain label."
 
     @property
     def doubts(self) -> tuple[str, ...]:

@@ -298,7 +298,7 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
         axes.set_xlim(0.0, _HIGHEST_SHEAR)
         label_axes(axes, MAX_SHEAR, "volume above this strain, mL", f"Strain-volume curve, {scale} axis")
         if noise_floor is not None:
-            axes.axvspan(0.0, noise_floor, color=BAND, alpha=0.5, linewidth=0, label="below the noise floor")
+            axes.axvspan(0.0, noise_floor, **BAND, label="below the noise floor")
     panels[0].set_ylim(bottom=0.0)
     legend(panels[0])
     return figure

@@ -1,4 +1,4 @@
-"""Figures of a label map that was made or corrected by an image: its tissues, and what is unsure or was changed."""
+"""Figures of a label map made or corrected by an image: tissues, and where they are uncertain or were changed."""
 
 import numpy as np
 from matplotlib import colormaps

@@ -17,6 +17,7 @@ from PIL import Image as Pixels
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.report.alike import alike
 from dvc.report.html import packed, policy, stored, template
 from dvc.threads import usable_cores
 from dvc.trust.verdict import Level, Verdict
@@ -164,11 +165,11 @@ class Section:
 def shown(value: Cell) -> str:
     """A table cell as people read it.
 
-    >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
-    ['0.123', '1234', '12', '–', '–', 'fat']
+    >>> [shown(v) for v in (0.123456, 1234.5, 12, 0.00001, float("nan"), None, "fat")]
+    ['0.123', '1234', '12', '0.0000', '–', '–', 'fat']
     """
     if isinstance(value, float | np.floating) and np.isfinite(value):
-        return f"{value:z.0f}" if abs(value) >= 100 else f"{value:z.3g}"
+        return f"{value:z.4f}" if 0.0 < abs(value) < 1e-4 else f"{value:z.0f}" if abs(value) >= 100 else f"{value:z.3g}"
     return "–" if value is None or isinstance(value, float | np.floating) else str(value)
 
 
@@ -186,6 +187,8 @@ def record_lines(record: Mapping[str, object]) -> dict[str, str]:
 def _line(value: object) -> str:
     if isinstance(value, list) and value and isinstance(value[0], Mapping):
         return "\n".join(", ".join(str(v) for v in item.values()) for item in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {one}" for name, one in value.items() if one not in (None, [], {})) or "not given"
     return str(value)
 
 
@@ -233,7 +236,7 @@ def write_report(
         list(pool.map(_small, (png for one in pictures for png in (one.png, *(png for _, png in one.beneath)))))
     style, script, library = stored("page.css"), stored("page.js"), _library() if volumes else None
     scripts = [script, library["script"], library["code"]] if library else [script]
-    page = template("report", shown=shown).render(
+    page = template("report", shown=shown, alike=alike).render(
         **told, sections=sections, volumes=volumes, style=style, script=script, library=library,
         policy=policy(style, scripts, viewer=bool(volumes)), reload_s=reload_s, beneath={},
     )  # fmt: skip

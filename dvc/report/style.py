@@ -12,6 +12,7 @@ from importlib.resources import files
 from typing import Any, Self
 from zlib import crc32
 
+from cycler import cycler
 from matplotlib.font_manager import fontManager
 from matplotlib.patheffects import withStroke
 
@@ -27,19 +28,43 @@ FONT: dict[str, Any] = {"family": FAMILY, "fontsize": 10}
 SMALL: dict[str, Any] = {"family": FAMILY, "fontsize": SMALL_PT}
 """Of numbers at an axis, legends and scale bars."""
 INK = "#1c2733"
-RULE, GRID, BAND = "#9aa5b1", "#d9dee4", "#b8bfc9"
-"""Greys of lines that mark a value, of the grid, and of what is not sure."""
+RULE, GRID = "#7d8894", "#d9dee4"
+"""Greys of lines that mark a value, and of the grid."""
+BAND: dict[str, Any] = {"facecolor": "#e3e7ec", "edgecolor": RULE, "linewidth": 0.8}
+"""For `Axes.fill_between` and `Axes.axvspan`: a range of values, pale under the curves, with a rule at its edges."""
 BOLD: dict[str, Any] = {"family": "DejaVu Sans", "weight": "bold", "fontsize": 10}
 """For letters with a rim alone, which a PDF holds as outlines."""
 ON_DARK: dict[str, Any] = {"color": "white", "path_effects": [withStroke(linewidth=2.2, foreground="black")]}
 ON_LIGHT: dict[str, Any] = {"color": INK, "path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 """Of what is written over a picture."""
 
-# The palette of Okabe and Ito without black, which is the measurement's, and yellow, which is faint on white.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# Four of the palette of Okabe and Ito, then brown and violet: its black is the measurement's, and the contrast of its
+# yellow, orange and sky blue on white is below 3:1.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#7A4B00", "#7B2FE0")
 _DASHES: tuple[Any, ...] = ("-", (0, (5.0, 1.6)), (0, (1.2, 1.2)), (0, (6.0, 1.5, 1.2, 1.5)))
 _MARKERS = "os^DvPX"
 _COUNT = len(_COLOURS) * len(_DASHES)
+FIGURE_STYLE: dict[str, Any] = {
+    "font.family": FAMILY,
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "legend.fontsize": SMALL_PT,
+    "xtick.labelsize": SMALL_PT,
+    "ytick.labelsize": SMALL_PT,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.prop_cycle": cycler(linestyle=_DASHES) * cycler(color=_COLOURS),
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.8,
+    "lines.markersize": 5,
+    "legend.frameon": False,
+    "image.cmap": "viridis",
+    "figure.constrained_layout.use": True,
+}
+"""The style for figures of one's own: ``matplotlib.pyplot.style.use(dvc.FIGURE_STYLE)``."""
 TISSUES = ("bone", "muscle", "tendon", "skin", "fat", "ligament")
 """Tissues in the order of the looks that they always have."""
 

@@ -169,7 +169,7 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
             solvers.setdefault(_solver(record), []).append(name)
         else:
             others.append(f"{name} ({path.suffix[1:]})")
-    ours = " ".join([*(f"{_listed(names)} {how}" for how, names in solvers.items()), *sets])
+    ours = " ".join([*(_models(names) + how for how, names in solvers.items()), *sets])
     return [
         *([ours] if sets else []),
         *([f"{_DRIVEN} {' '.join(driven)}"] if driven else []),
@@ -177,6 +177,10 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
         *(f"{_listed(names)}: {how}" for how, names in levelled.items()),
         *([f"Models computed with other programs: {_listed(others)}."] if others else []),
     ]
+
+
+def _models(names: Sequence[str]) -> str:
+    return f"The model{'s' * (len(names) > 1)} {_listed(names)} {'were' if len(names) > 1 else 'was'} "
 
 
 _DRIVEN = (
@@ -218,7 +222,7 @@ def _solver(record: Record) -> str:
         )
     contact = "bonded to the plate from first contact on" if parameters.get("taped", True) else "without friction"
     return (
-        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh or ''}: {parameters['element']}; "
+        f"computed with mrstrain {versions.get('mrstrain', '?')}{mesh or ''}: {parameters['element']}; "
         f"plate {parameters['plate']}; skin {contact}; fixed: {', '.join(parameters['fixed'])}; loads {loads}."
     )
 

@@ -89,7 +89,7 @@ def label(
         record = provenance("label", inputs, {}) | found | {"labels_sha256": file_hash(files.labels)}
         write_json(files.beside(".json"), record)
     volumes = volumes_ml(made.labels)
-    unsure = f"{100 * made.unsure:.0f} % of the voxels are unsure (probability below 90 %)"
+    unsure = f"{100 * made.unsure:.0f} % of the voxels have an uncertain label (probability below 90 %)"
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
     lines = (told, f"{unsure}; {files.picture} shows where.", *made.notes, f"Label map: {files.labels}")
     made_from = f"Label map made from {'another subject' if drawn.paths else 'the image'}"

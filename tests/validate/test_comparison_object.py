@@ -19,7 +19,8 @@ from dvc.worker import side_by_side
 from tests.pictures import real_pictures
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
-from validate.report import area_rows, load_sections
+from validate.ranking import rank_over_loads
+from validate.report import area_rows, load_sections, overview
 from validate.tables import read_curves
 
 ROWS = ("areas", "overlaps", "agreements", "skin", "representations", "model_forms")
@@ -213,3 +214,24 @@ def test_tables_show_no_negative_zero_and_no_rounding_of_zero() -> None:
         for table in section.tables:
             cells = [shown(cell) for row in (*table.rows, *table.apart) for cell in row]
             assert not [cell for cell in cells if re.match(r"-0(\.0*)?$|.*e-1\d", cell)], table.title
+
+
+def test_the_first_part_of_a_report_answers_and_all_else_is_folded(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    parts = re.findall(r'<details id="(part-\d+)"[^>]*?( open)?>', page)
+    assert len(parts) > 5
+    assert [name for name, is_open in parts if is_open] == ["part-1"]
+
+
+def test_loads_without_an_informative_area_are_named_once_and_marked_in_the_table() -> None:
+    models = [result(name, cube(6), sheared(gamma)) for name, gamma in {"a": 0.5, "b": 0.3}.items()]
+    gammas = {"Load1": 0.38, "Load2": 0.6, "Load3": 0.38}
+    loads = [compare_load(case(n, sheared(g), models, error_table(0.0, 0.001)), labels()) for n, g in gammas.items()]
+    loads[2] = replace(loads[2], case=replace(loads[2].case, verdict=Verdict("caution", ("Poor.",))))
+    first = overview(loads, rank_over_loads(loads), (), (), ())
+    doubt = "less than 1 % of the tissue exceeds 0.2, so the area metric is not informative."
+    assert [line for line in first.paragraphs if doubt in line] == [f"Load1, Load3: {doubt}"]
+    heads = ("Load1 (not informative)", "Load2", "Load3 (use with care, not informative)", "all loads")
+    assert first.tables[0].columns[2:] == heads
+    pictures: Any = dict.fromkeys(("curves", "slices"))
+    assert load_sections(loads[0], pictures, pictures)[0].verdict is None  # what is not informative is no verdict

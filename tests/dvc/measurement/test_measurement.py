@@ -64,11 +64,12 @@ def test_labels_made_from_the_image_are_told_and_count_in_the_verdict(measured) 
     before = dvc.Measurement.from_registration(measured.source.registration, measured.source.subject)
     assert sure.verdict == before.verdict
     drawn = dict.fromkeys(sure.drawings(), Picture("", "", PNG))
-    assert "The label map was made from the image; 20 % of its voxels are unsure." in sure.section(drawn).tables[0].note
+    told = "The label map was made from the image; 20 % of its voxels have an uncertain label."
+    assert told in sure.section(drawn).tables[0].note
     unsure = again(LabelsFromImage(0.21, (note,)))
     assert unsure.verdict.level == "caution"
     assert unsure.verdict.reasons[-2] == f"The label map was made from the image. {note}"
-    assert "21 % of its voxels are unsure (use with care above 20 %)" in unsure.verdict.reasons[-1]
+    assert "21 % of its voxels have an uncertain label (use with care above 20 %)" in unsure.verdict.reasons[-1]
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,12 @@ from matplotlib.figure import Figure
 
 from dvc.errors import OutputError
 from dvc.images.image import Grid, Image, LabelMap
-from dvc.report import figures
+from dvc.report import drawing, figures
 from dvc.report.chart import chart, label_axes, legend
 from dvc.report.drawing import Drawing, save_figure
 from dvc.report.sheet import View
-from dvc.report.style import TISSUES, Look, looks
+from dvc.report.style import INK, RULE, TISSUES, Look, looks
+from tests.pictures import LEAST_CONTRAST, contrast_on_white, pale_lines
 
 pytestmark = pytest.mark.usefixtures("real_pictures")
 
@@ -133,18 +134,54 @@ def test_a_name_looks_the_same_everywhere_and_no_two_alike() -> None:
     assert len(looks(map(str, range(60)))) == 60  # they begin anew
 
 
-def _seen_by_a_deuteranope(colour: str) -> np.ndarray:
-    """CIELAB-like lightness and hue after Viénot, Brettel and Mollon (1999): red and green fall together."""
-    rgb = np.array(to_rgb(colour)) ** 2.2
-    to_lms = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]])
-    blind = np.array([[1.0, 0.0, 0.0], [0.494207, 0.0, 1.24827], [0.0, 0.0, 1.0]])
-    seen = np.linalg.inv(to_lms) @ blind @ to_lms @ rgb
-    return np.asarray(np.clip(seen, 0.0, 1.0) ** (1 / 2.2))
+LOOKS = [Look.numbered(number).colour for number in range(6)]
+# Linear RGB as seen without one kind of cones, after Machado, Oliveira and Fernandes (2009), 10.1109/TVCG.2009.113.
+CONES = {
+    "all": np.eye(3),
+    "no red": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "no green": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "no blue": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
 
-def test_colours_are_told_apart_without_green_cones() -> None:
-    colours = [Look.numbered(number).colour for number in range(6)]
-    apart = [np.linalg.norm(np.subtract(*map(_seen_by_a_deuteranope, pair))) for pair in combinations(colours, 2)]
-    assert min(apart) > 0.12
-    red_green = np.linalg.norm(np.subtract(*map(_seen_by_a_deuteranope, ("#b04040", "#6f8a3a"))))
-    assert red_green < 0.12  # the measure sees what it should
+def nearest(colours: list[str], cones: str) -> float:
+    """Smallest CIE 1976 colour difference of two of them as seen with these cones; 2.3 is just noticeable."""
+    rgb = np.array([to_rgb(colour) for colour in colours])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    xyz = np.clip(linear @ np.transpose(CONES[cones]), 0.0, 1.0) @ TO_XYZ.T / TO_XYZ.sum(axis=1)
+    x, y, z = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29).T
+    lab = np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
+    return float(min(np.linalg.norm(one - other) for one, other in combinations(lab, 2)))
+
+
+@pytest.mark.parametrize("cones", CONES)
+def test_colours_are_distinguishable_with_every_common_kind_of_colour_vision(cones: str) -> None:
+    assert nearest(LOOKS, cones) > 16.0
+    assert nearest(["#b04040", "#6f8a3a"], "no green") < 16.0 < nearest(["#b04040", "#6f8a3a"], "all")
+
+
+@pytest.mark.parametrize("cones", CONES)
+def test_no_look_is_taken_for_the_measurement_in_black(cones: str) -> None:
+    assert nearest([*LOOKS, "black"], cones) > 16.0
+
+
+def test_lines_of_every_look_can_be_seen_on_white() -> None:
+    assert not [colour for colour in (*LOOKS, RULE, INK) if contrast_on_white(colour) < LEAST_CONTRAST]
+    assert contrast_on_white("black") == pytest.approx(21.0)
+    assert contrast_on_white("#767676") == pytest.approx(4.54, abs=0.01)  # WCAG's own example of what is just legible
+    assert contrast_on_white("#E69F00") < LEAST_CONTRAST  # the orange of Okabe and Ito
+    assert contrast_on_white("#56B4E9") < LEAST_CONTRAST  # and their sky blue
+
+
+def test_a_chart_with_a_pale_line_is_found() -> None:
+    figure, (axes,) = chart()
+    axes.plot([0.0, 1.0], [0.0, 1.0], **looks(["heel"])["heel"].marked)
+    axes.axhline(0.5, color=RULE)
+    label_axes(axes, "x", "y", "seen")
+    assert not pale_lines(figure)
+    axes.plot([0.0, 1.0], [1.0, 0.0], color="#E69F00")
+    axes.vlines([0.5], 0.0, 1.0, color="black", alpha=0.2)
+    assert len(pale_lines(figure)) == 2
+    with pytest.raises(AssertionError, match="seen"):
+        drawing.png_bytes(figure)

@@ -17,6 +17,7 @@ from PIL import Image as Pixels
 
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, LabelMap
+from dvc.report.alike import alike
 from dvc.report.drawing import png_bytes
 from dvc.report.figures import shear_curves
 from dvc.report.page import Picture, Section, Table, Viewer, Volume, shown, write_report
@@ -157,6 +158,19 @@ def test_reasons_of_the_only_load_are_told_once_and_of_several_loads_with_each(t
     assert alone.count("Slices are 4 mm apart.") == alone.count('<span class="pill caution">') == 1
     both = page(Section("Load1", doubtful), Section("Load2", Verdict("distrust", ("Fat folds.",))))
     assert both.count("Slices are 4 mm apart.") == 1
+
+
+def test_a_reason_of_several_loads_is_told_once_with_their_names(tmp_path: Path) -> None:
+    thick, far = "Slices are 4 mm apart.", "soft: the displacement is 0.001 times as large as the measured one."
+    of_loads = [Verdict("caution", (thick,)).among(load) for load in ("Load1", "Load2")]
+    of_model = Verdict("caution", (f"Load1: {far}", f"Load2: {far}", "Fat: Load1 and Load2 overlap."))
+    whole = worst([*of_loads, of_model])
+    write_report(tmp_path / "r.html", "A heel", whole, [Section("Models", of_model), Section("Load1")], (), {})
+    page = (tmp_path / "r.html").read_text()
+    assert f"Load1, Load2, registration (Use with care): {thick}" in page
+    assert f"Load1, Load2: {far}" in page
+    assert page.count(thick) == page.count(far) == page.count("Fat: Load1 and Load2 overlap.") == 1
+    assert alike(("Load1: A.", "Load2: B.", "No load.")) == ("Load1: A.", "Load2: B.", "No load.")
 
 
 def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_path: Path) -> None:

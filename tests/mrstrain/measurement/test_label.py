@@ -54,7 +54,7 @@ def test_everything_is_written_and_agrees(folder: Path) -> None:
     assert record["inputs"]["bone"][0]["sha256"]
     assert 0.0 < record["unsure"] < 0.5
     told = (folder / "told.txt").read_text()
-    assert f"{100 * record['unsure']:.0f} % of the voxels are unsure" in told
+    assert f"{100 * record['unsure']:.0f} % of the voxels have an uncertain label" in told
     assert told.endswith(f"Label map: {made / 'tissues.nii.gz'}")
 
 

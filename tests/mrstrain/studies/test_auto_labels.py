@@ -53,7 +53,7 @@ def test_the_label_map_is_made_and_measured_with(study):
     record = json.loads((study / "results" / "registration" / "Load1" / "provenance.json").read_text())
     unsure = record["parameters"]["labels_from_image"]["unsure"]
     assert unsure == json.loads((made / "tissues.json").read_text())["unsure"]
-    assert f"{100 * unsure:.0f} % of its voxels are unsure" in page
+    assert f"{100 * unsure:.0f} % of its voxels have an uncertain label" in page
 
 
 def test_a_study_without_models_begins_with_the_strain_in_a_picture(study):

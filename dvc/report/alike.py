@@ -1,0 +1,20 @@
+"""Sentences that hold for several loads are told once."""
+
+import re
+from collections.abc import Iterable
+
+_SENTENCE = re.compile(r"(?P<of>[^:.]+?)(?P<kind>, registration \([^)]*\))?: (?P<what>.+)", re.DOTALL)
+
+
+def alike(sentences: Iterable[str]) -> tuple[str, ...]:
+    """Equal sentences on several loads as one that names them all, in the place of the first.
+
+    >>> alike(["Load1: no result.", "Fat folds.", "Load2: no result."])
+    ('Load1, Load2: no result.', 'Fat folds.')
+    """
+    of: dict[tuple[str, str], list[str]] = {}
+    for sentence in sentences:
+        found = _SENTENCE.fullmatch(sentence)
+        kind, what = (found["kind"] or "", found["what"]) if found else ("", sentence)
+        of.setdefault((kind, what), []).extend([found["of"]] if found else [])
+    return tuple(f"{', '.join(names)}{kind}: {what}" if names else what for (kind, what), names in of.items())
