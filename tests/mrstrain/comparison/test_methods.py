@@ -257,6 +257,7 @@ def test_the_libraries_told_are_those_that_read_and_write(tmp_path: Path, name: 
     suffix = imagefile._known_suffix(name)
     reader = "dvc.io.images.dicom" if suffix is None else imagefile._FORMATS[suffix][1].__module__
     used = libraries_of(reader, set()) | libraries_of("dvc.io.images.write", set())
+    used -= {"psutil"}  # it only tells whether a process that left a file behind still runs
     assert set(re.findall(r"[\w-]+(?= \d)", sentence)) - {"Lowekamp"} == used - {"numpy"}
     assert sentence.startswith(f"Images ({imagefile.format_of(name)}) were read, and maps (NIfTI, NRRD) were written")
     for library in used - {"numpy"}:
