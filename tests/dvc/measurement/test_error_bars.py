@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from dvc.images.depth import to_surface_mm
 from dvc.images.image import Grid
 from dvc.measurement import error_bars
-from dvc.images.depth import to_surface_mm
 
 GRID = Grid((40, 36, 30), (0.8, 0.8, 1.6), (0.0, 0.0, 0.0))
 
