@@ -68,9 +68,9 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     looked.at_loaded(reference)
     if labels is not None and told.models.results:
         looked.tried(looked.at_results, labels)
-    looked.at_report_details()
     planned = looked.tried(plan, told)
-    if planned is not None and not looked.wrong:
+    if planned is not None and not looked.wrong:  # else only what is wrong counts
+        looked.at_report_details()
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
         looked.notes += (
             costs(told, planned, left, *sizes_of(told), workers or usable_cores())

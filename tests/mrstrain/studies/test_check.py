@@ -109,6 +109,10 @@ def test_what_is_not_given_of_acquisition_and_credibility_is_a_note_in_one_line_
         "flip_angle_deg",
     }
     assert after["[credibility]"].startswith("context_of_use, ")
+    (study / "Load1.nii.gz").unlink()
+    ill = check(study)
+    assert ill.wrong  # is all that is told
+    assert not any(note.startswith("Not given") for note in ill.notes)
 
 
 def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
