@@ -159,6 +159,31 @@ def _room_for(count: int, gradient: bool) -> tuple[IntArray, FloatArray, FloatAr
 
 
 @njit(nogil=True, cache=True)
+def _deepest(n, depth, own, rest, at, values, slopes, gradient, tissue, value, slope):  # type: ignore[no-untyped-def]
+    """Point n: the tissue of the eight voxels around it that it lies deepest in; depths and slopes as `_depths_at`.
+
+    ``at`` are the indices of coefficients along each axis, the second that of the voxel before the point; ``values``
+    and ``slopes`` are the weights of these coefficients.
+    """
+    tissue[n], value[:, n] = 0, -np.inf
+    tried = -1
+    for corner in range(8):
+        number = own[at[0][1 + (corner >> 2)], at[1][1 + (corner >> 1 & 1)], at[2][1 + (corner & 1)]]
+        if number == tried or (corner and number == tissue[n]):
+            continue
+        tried = number
+        mm, by_x, by_y, by_z = summed_spline(depth[number], at, values, slopes)
+        if mm > value[0, n]:
+            tissue[n], value[0, n] = number, mm
+            if gradient:
+                slope[0, n, 0], slope[0, n, 1], slope[0, n, 2] = by_x, by_y, by_z
+    if rest >= 0:
+        value[1, n], by_x, by_y, by_z = summed_spline(depth[rest], at, values, slopes)
+        if gradient:
+            slope[1, n, 0], slope[1, n, 1], slope[1, n, 2] = by_x, by_y, by_z
+
+
+@njit(nogil=True, cache=True)
 def _depths_at(
     start: int, stop: int, depth: FloatArray, own: IntArray, rest: int, indices: FloatArray, gradient: bool,
     tissue: IntArray, value: FloatArray, slope: FloatArray,
@@ -171,30 +196,15 @@ def _depths_at(
     ni, nj, nk = own.shape
     for n in range(start, stop):
         x, y, z = indices[n, 0], indices[n, 1], indices[n, 2]
-        tissue[n], value[:, n] = 0, -np.inf
         if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
-            value[0, n] = np.nan
+            tissue[n], value[0, n], value[1, n] = 0, np.nan, -np.inf
             continue
         i, j, k = np.floor(x), np.floor(y), np.floor(z)
         a, da = spline_basis(x - i)
         b, db = spline_basis(y - j)
         c, dc = spline_basis(z - k)
         at = indices_around(i, ni), indices_around(j, nj), indices_around(k, nk)
-        tried = -1
-        for corner in range(8):
-            number = own[at[0][1 + (corner >> 2)], at[1][1 + (corner >> 1 & 1)], at[2][1 + (corner & 1)]]
-            if number == tried or (corner and number == tissue[n]):
-                continue
-            tried = number
-            mm, by_x, by_y, by_z = summed_spline(depth[number], at, (a, b, c), (da, db, dc))
-            if mm > value[0, n]:
-                tissue[n], value[0, n] = number, mm
-                if gradient:
-                    slope[0, n, 0], slope[0, n, 1], slope[0, n, 2] = by_x, by_y, by_z
-        if rest >= 0:
-            value[1, n], by_x, by_y, by_z = summed_spline(depth[rest], at, (a, b, c), (da, db, dc))
-            if gradient:
-                slope[1, n, 0], slope[1, n, 1], slope[1, n, 2] = by_x, by_y, by_z
+        _deepest(n, depth, own, rest, at, (a, b, c), (da, db, dc), gradient, tissue, value, slope)
 
 
 @njit(nogil=True, cache=True)
@@ -222,22 +232,7 @@ def _depths_at_voxels(
                 at = (
                     indices_around(x, shape[0])[:3], indices_around(y, shape[1])[:3], indices_around(z, shape[2])[:3],
                 )  # fmt: skip
-                tissue[n], value[:, n] = 0, -np.inf
-                tried = -1
-                for corner in range(8):
-                    number = own[at[0][1 + (corner >> 2)], at[1][1 + (corner >> 1 & 1)], at[2][1 + (corner & 1)]]
-                    if number == tried or (corner and number == tissue[n]):
-                        continue
-                    tried = number
-                    mm, by_x, by_y, by_z = summed_spline(depth[number], at, values, slopes)
-                    if mm > value[0, n]:
-                        tissue[n], value[0, n] = number, mm
-                        if gradient:
-                            slope[0, n, 0], slope[0, n, 1], slope[0, n, 2] = by_x, by_y, by_z
-                if rest >= 0:
-                    value[1, n], by_x, by_y, by_z = summed_spline(depth[rest], at, values, slopes)
-                    if gradient:
-                        slope[1, n, 0], slope[1, n, 1], slope[1, n, 2] = by_x, by_y, by_z
+                _deepest(n, depth, own, rest, at, values, slopes, gradient, tissue, value, slope)
                 n += 1
 
 
