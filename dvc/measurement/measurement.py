@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Self
 
@@ -12,14 +12,15 @@ from matplotlib.figure import Figure
 
 from dvc.arrays import Float32Array, FloatArray
 from dvc.atomic_files import whole_folder, write_json
-from dvc.deformation.protocol import Deformation, RigidMotion, Within
+from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps, strain_maps
-from dvc.errors import GeometryError, InputError
-from dvc.images.image import Image, Mask
+from dvc.errors import InputError
+from dvc.images.image import Image
 from dvc.io import error_files, result_folder as files
 from dvc.measurement import judgement, page
 from dvc.measurement.error_bars import NO_ERROR_BARS, ErrorBars, error_bars
 from dvc.measurement.judgement import Evidence, Source
+from dvc.measurement.stored import figures_to_store, read_stored
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
@@ -31,11 +32,9 @@ from dvc.trust.assessment import assess
 from dvc.trust.components import ComponentUncertainty
 from dvc.trust.field_draws import TrueField
 from dvc.trust.quality import Quality, noise_floor
-from dvc.trust.regions import RegionRow, read_regions_csv, region_statistics, write_regions_csv
+from dvc.trust.regions import RegionRow, region_statistics, write_regions_csv
 from dvc.trust.uncertainty import Interval
 from dvc.trust.verdict import Verdict
-
-_SHOWN = "slices_meet_at_lps_mm"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,34 +170,10 @@ class Measurement:
         GeometryError
             If the image is on another grid than the maps.
         """
-        place = Path(folder)
-        loads = sorted({path.parent.name for path in place.glob(f"*/{files.QUALITY}")} - {files.REPEAT})
-        if loads and not (place / files.QUALITY).is_file():
-            raise InputError(f"{place} has several loads ({', '.join(loads)}); read one, such as {place / loads[0]}.")
-        told = files.read_quality(place)
-        try:
-            quality, alignment = Quality.from_dict(told), dict(told["alignment"])
-            files.motion_in(alignment)
-            at = np.array(told[_SHOWN].split(), dtype=np.float64) if told.get(_SHOWN) else None
-        except (KeyError, TypeError, ValueError, AttributeError) as failure:
-            what = f"damaged, or not written by `Measurement.write` ({failure!r})"
-            raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
-        maps = files.read_maps(place)
-        uncertainty, model = error_files.read_uncertainty(place, maps.grid) or (None, None)
-        if image is not None and not image.grid.same_as(maps.grid):
-            what = f"The image is on another grid ({image.grid}) than the maps in {place} ({maps.grid})"
-            raise GeometryError(f"{what}. Pass the unloaded image of that measurement.")
-        if image is None and (place / files.REGISTERED).is_file():
-            image = files.read_scalar(place / files.REGISTERED, maps.grid)
-        regions = tuple(read_regions_csv(place / files.REGIONS))
-        bars = ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model)
-        if (place / files.SPLINE).is_file():  # with its own gradient, not its displacement at the voxels
-            mask = Mask(maps.grid, maps.valid)
-            deformation: Deformation = Within(files.spline_in(place), mask, margin_voxels=0)
-        else:
-            deformation = files.ResultFolder(place).deformation()
-        name, figures = place.resolve().name, (deformation, maps, alignment, quality, regions, bars, image, None, at)
-        return cls(name, *figures, is_repeat=name == files.REPEAT)
+        stored = read_stored(Path(folder), image)
+        return cls(
+            **{one.name: getattr(stored, one.name) for one in fields(stored)}, is_repeat=stored.name == files.REPEAT
+        )
 
     @property
     def verdict(self) -> Verdict:
@@ -225,9 +200,9 @@ class Measurement:
     def draws(self, count: int, *, seed: int = 1) -> Iterator[TrueField]:
         """Draw true fields that agree with what was measured and with its errors, about 1 s each at 128^3 voxels.
 
-        Errors are alike in neighbouring voxels, and each draw errs as one registration of the accuracy study did. The
-        spread of a figure over the draws is that of one voxel's error where the figure is of few voxels. Of a whole
-        tissue it is too small: `intervals` are widened for that, and draws are not.
+        The spread of a figure over the draws shows its uncertainty. Errors are alike in neighbouring voxels, partly the
+        same in a whole tissue, and in each draw those of one registration of the accuracy study. Draws are not widened
+        as `intervals` are.
 
         Parameters
         ----------
@@ -248,8 +223,8 @@ class Measurement:
         """
         if count < 1:
             raise InputError(f"The number of draws must be 1 or more; got {count}.")
-        fields = self.error_bars.draws(self.maps, seed)
-        return (fields.drawn() for _ in range(count))
+        draws = self.error_bars.draws(self.maps, seed)
+        return (draws.drawn() for _ in range(count))
 
     @property
     def components(self) -> ComponentUncertainty | None:
@@ -389,17 +364,10 @@ class Measurement:
             If it cannot be written.
         """
         made, verdict, bars = self._made_from(), self.verdict, self.error_bars
-        told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
-        found = made.registration
-        if self.shown_mm is not None:
-            told[_SHOWN] = " ".join(map(str, self.shown_mm.tolist()))
-        if found is not None:
-            if chosen := found.choice.as_dict():
-                told["regularisation"] = chosen
-            told["error_of_max_shear"] = bars.as_dict()
+        told = figures_to_store(self.quality, self.alignment, self.shown_mm, made.registration, bars)
         with whole_folder(Path(folder)) as partial, ThreadPoolExecutor(1) as pool:
             writing = [pool.submit(files.write_maps, partial, self.maps, made.subject.axes, verdict)]
-            if found is not None and made.images is not None:
+            if (found := made.registration) is not None and made.images is not None:
                 writing.append(pool.submit(judgement.write_images_and_transforms, partial, found, made.images))
             if bars.uncertainty is not None:
                 sure, grid = bars.uncertainty, self.maps.grid
@@ -429,9 +397,4 @@ class Measurement:
 
     def _view(self, point_mm: npt.ArrayLike | None = None) -> View:
         """The slices through a point, through the bone's lowest point, or through the tissue's middle."""
-        grid, valid = self.maps.grid, self.maps.valid
-        point = self.shown_mm if point_mm is None else point_mm
-        if point is None:
-            points = grid.points(valid if valid.any() else np.ones(grid.shape, dtype=bool))
-            point = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
-        return View.through(grid, point, valid)
+        return View.through(self.maps.grid, self.shown_mm if point_mm is None else point_mm, self.maps.valid)

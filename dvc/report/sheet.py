@@ -67,13 +67,17 @@ class View:
 
     @classmethod
     def through(
-        cls, grid: Grid, point_mm: npt.ArrayLike, around: BoolArray | None = None, margin_mm: float = 8.0
+        cls, grid: Grid, point_mm: npt.ArrayLike | None, around: BoolArray | None = None, margin_mm: float = 8.0
     ) -> Self:
         """The slices nearest to a point, LPS mm, cropped to a mask and a margin around it, or the whole of them.
 
+        Without a point, through the voxel of the mask, or of the grid, that is nearest to the mean of all of them.
         GeometryError if the point lies outside the grid, or the mask has another shape.
         """
         lps = grid.toward_lps()
+        if point_mm is None:
+            points = grid.points(around if around is not None and around.any() else np.ones(grid.shape, dtype=bool))
+            point_mm = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
         point = np.asarray(point_mm, dtype=np.float64)
         if point.shape != (3,) or not bool(lps.contains(point)):
             where = f"LPS {point.tolist()} mm, is outside the image ({grid})"
