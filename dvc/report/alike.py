@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 
-_SENTENCE = re.compile(r"(?P<of>[^:.]+?)(?P<kind>, registration \([^)]*\))?: (?P<what>.+)", re.DOTALL)
+_SENTENCE = re.compile(r"(?P<of>[^:.(]+?)(?P<kind>, registration \([^)]*\))?: (?P<what>.+)", re.DOTALL)
 
 
 def alike(sentences: Iterable[str]) -> tuple[str, ...]:
@@ -11,6 +11,11 @@ def alike(sentences: Iterable[str]) -> tuple[str, ...]:
 
     >>> alike(["Load1: no result.", "Fat folds.", "Load2: no result."])
     ('Load1, Load2: no result.', 'Fat folds.')
+
+    What comes before the colon is a load only without a remark in brackets:
+
+    >>> alike(["Best match (area): a.", "Best match under Load1 (area): a."])
+    ('Best match (area): a.', 'Best match under Load1 (area): a.')
     """
     of: dict[tuple[str, str], list[str]] = {}
     for sentence in sentences:
