@@ -72,7 +72,7 @@ class Measurement:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> from dvc import Affine, Grid, Image
+    >>> from dvc import Affine, Grid, Image, Mask
     >>> grid = Grid((8, 8, 8), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
     >>> values = np.zeros(grid.shape, dtype=np.float32)
     >>> values[2:6, 2:6, 2:6] = 1.0
