@@ -23,15 +23,16 @@ _FULL_WIDTH = 0.15  # at half maximum, of the blur that a bias field gives the h
 _WIENER_NOISE = 0.01
 
 
-def without_bias_field(image: Image) -> Image:
+def without_bias_field(image: Image, bright: BoolArray | None = None) -> Image:
     """An image, above its lowest value, divided by its bias field, estimated by N4 on a coarse copy.
 
     Normalised correlation over the whole body takes a bias field for contrast, and a B-spline then bends tissue to
     follow it: on a phantom with fields of +-20 % that tripled the strain error. Only the registration sees the
-    corrected image; outputs are made from the image as it was given.
+    corrected image; outputs are made from the image as it was given. ``bright`` are its voxels that are not air, by
+    default `bright_voxels`.
     """
     known, shape = fill_missing(image), image.grid.shape
-    inside = bright_voxels(known)
+    inside = bright_voxels(known) if bright is None else bright
     steps = [round(_COARSE_MM / float(spacing)) for spacing in image.grid.spacing_mm]
     steps = [int(np.clip(step, 1, max(1, n // 8))) for step, n in zip(steps, shape, strict=True)]
     coarse = tuple(slice(step // 2, None, step) for step in steps)

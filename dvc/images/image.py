@@ -1,7 +1,7 @@
 """Images on a grid in space: Grid, Image, Mask, LabelMap; LPS mm, indexed ``values[i, j, k]`` along the grid's axes."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self, TypeVar
 
@@ -184,7 +184,7 @@ def _on(grid: Grid, what: str, values: npt.ArrayLike, kind: type[_T]) -> npt.NDA
     return array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Image:
     """A scalar image on a grid; single precision, as scanners give it.
 
@@ -250,12 +250,7 @@ class Mask:
 
     def box(self, around: int = 0) -> tuple[slice, slice, slice]:
         """Slices of the smallest box that holds the mask, and ``around`` voxels beside it; empty for an empty mask."""
-        hits = [np.flatnonzero(self.inside.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
-        if not hits[0].size:
-            return (slice(0, 0),) * 3
-        ends = ((int(hit[0]) - around, int(hit[-1]) + 1 + around) for hit in hits)
-        i, j, k = (slice(max(low, 0), min(high, n)) for (low, high), n in zip(ends, self.inside.shape, strict=True))
-        return i, j, k
+        return box_of(self.inside, (around,) * 3)
 
     @property
     def volume_mm3(self) -> float:
@@ -269,6 +264,16 @@ class Mask:
     def toward_lps(self) -> Self:
         """The same mask with its axes closest to L, P, S."""
         return replace(self, grid=self.grid.toward_lps(), inside=reordered_to_lps(self.grid, self.inside))
+
+
+def box_of(inside: BoolArray, around: Sequence[int]) -> tuple[slice, slice, slice]:
+    """As `Mask.box` of an array (ni, nj, nk), with as many voxels beside it along each axis."""
+    hits = [np.flatnonzero(inside.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+    if not hits[0].size:
+        return (slice(0, 0),) * 3
+    ends = ((int(hit[0]) - beside, int(hit[-1]) + 1 + beside) for hit, beside in zip(hits, around, strict=True))
+    i, j, k = (slice(max(low, 0), min(high, n)) for (low, high), n in zip(ends, inside.shape, strict=True))
+    return i, j, k
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,16 +4,18 @@ import numpy as np
 from scipy.ndimage import binary_opening, label
 from skimage.filters import threshold_otsu
 
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
 from dvc.compiled import njit
 from dvc.errors import InputError
-from dvc.images.image import Image, Mask
+from dvc.images.image import Image, Mask, box_of
+from dvc.images.once import once_an_image
 from dvc.images.resample import fill_missing, smoothed
 
 _BLUR_MM = 1.0
 _CLOSE_MM = 4.0
 
 
+@once_an_image
 def tissue_mask(image: Image) -> Mask:
     """The body in an MR image: largest bright part, closed over dark bone and septa, holes filled.
 
@@ -40,11 +42,12 @@ def tissue_mask(image: Image) -> Mask:
     return Mask(image.grid, filled)
 
 
+@once_an_image
 def bright_voxels(image: Image) -> BoolArray:
     """Voxels that are not air: above half of Otsu's threshold on the image blurred by 1 mm, (ni, nj, nk)."""
     blurred = smoothed(fill_missing(image), _BLUR_MM).values.astype(np.float64)  # bins narrower than float32 can tell
     low = float(np.percentile(blurred, 1.0))
-    return np.asarray(blurred > low + 0.5 * (threshold_otsu(blurred) - low))
+    return frozen(blurred > low + 0.5 * (threshold_otsu(blurred) - low), np.bool_)
 
 
 def widened(mask: Mask, margin_mm: float) -> Mask:
@@ -58,13 +61,17 @@ def within(inside: BoolArray, spacing_mm: FloatArray, margin_mm: float) -> BoolA
     Exact, by the squares of distances along one axis after the other (T. Saito and J. Toriwaki 1994,
     doi:10.1016/0031-3203(94)90133-3); for margins of a few voxels faster than a distance transform.
     """
-    squares = np.where(inside, 0.0, np.inf)  # of the distance along the axes that were looked along, mm2
-    for axis, spacing in enumerate(spacing_mm):
-        away = (np.arange(1, int(margin_mm / spacing + 1e-9) + 1) * spacing) ** 2
+    reach = [int(margin_mm / spacing + 1e-9) for spacing in spacing_mm]
+    near = np.zeros(inside.shape, dtype=bool)
+    box = box_of(inside, reach)
+    squares = np.where(inside[box], 0.0, np.inf)  # of the distance along the axes that were looked along, mm2
+    for axis, (spacing, steps) in enumerate(zip(spacing_mm, reach, strict=True)):
         nearer = np.empty_like(squares)
+        away = (np.arange(1, steps + 1) * spacing) ** 2
         _nearer(np.moveaxis(squares, axis, 0), away, np.moveaxis(nearer, axis, 0))
         squares = nearer
-    return np.asarray(np.sqrt(squares) <= margin_mm)
+    near[box] = np.sqrt(squares) <= margin_mm
+    return near
 
 
 @njit(cache=True)

@@ -262,10 +262,11 @@ def _scored(
     # Single precision is enough for values about zero of a standard deviation of one.
     values = np.where(known, scene, np.median(scene[known])).astype(np.float64)
     values = ((values - values.mean()) / (values.std() or 1.0)).astype(np.float32)
-    size = [fft.next_fast_len(s + t, real=True) for s, t in zip(scene_grid.shape, template_grid.shape, strict=True)]
-    scene_f, square_f, known_f = (fft.rfftn(v, size) for v in (values, values**2, known.astype(np.float32)))
-    # A shift s of the template wraps round: its centre lies at index s + half of the scene.
+    # A shift s of the template wraps round: its centre lies at index s + half of the scene. No centre leaves the scene,
+    # so half of the template reaches beyond each end, and both ends may reach into the same margin.
     half = (np.array(template_grid.shape) - 1) // 2
+    size = [fft.next_fast_len(int(s + h), real=True) for s, h in zip(scene_grid.shape, half, strict=True)]
+    scene_f, square_f, known_f = (fft.rfftn(v, size) for v in (values, values**2, known.astype(np.float32)))
     shifts = np.ix_(*((np.arange(s) - h) % n for s, h, n in zip(scene_grid.shape, half, size, strict=True)))
 
     def scored(rotation: FloatArray) -> tuple[float, RigidMotion] | None:

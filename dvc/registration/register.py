@@ -23,9 +23,9 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion, Within
 from dvc.errors import InputError, ParameterError
 from dvc.images.bias_field import without_bias_field
-from dvc.images.image import Image, LabelMap, Mask
+from dvc.images.image import Image, LabelMap, Mask, reordered_to_lps
 from dvc.images.noise import Noise, noise_of
-from dvc.images.tissue import tissue_mask
+from dvc.images.tissue import bright_voxels, tissue_mask
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.registration.bone_mask import mirrored_doubt
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
@@ -219,7 +219,9 @@ def _aligned(
         return replace(scan, grid=scan.grid.moved_by(turn.T, np.zeros(3)))
 
     tell("aligning", 0.0)
-    fixed, moving = (turned(without_bias_field(scan)) for scan in (upright, loaded.toward_lps()))
+    scans = (reference, upright), (loaded, loaded.toward_lps())
+    bright = (reordered_to_lps(scan.grid, bright_voxels(scan)) for scan, _ in scans)  # known by then, as a rule
+    fixed, moving = (turned(without_bias_field(scan, where)) for (_, scan), where in zip(scans, bright, strict=True))
     body, labels = turned(body.toward_lps()), labels and turned(labels.toward_lps())
     on = settings.align_on
     rigid = turned(bone.toward_lps()) if bone and on == "bone" else None

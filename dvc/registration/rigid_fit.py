@@ -14,6 +14,7 @@ difference of two neighbours, is correlated neither with the voxel between them 
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Self
 
@@ -48,23 +49,34 @@ _FARTHEST_MM = 15.0
 _NEIGHBOURS = np.where(np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0) == 1, 1.0 / 6.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Level:
     """Both images with one blur: the unloaded one at points of the mask, the loaded one whole."""
 
     blur_mm: float
     points: FloatArray  # (n, 3), LPS mm
     values: FloatArray  # (n,), I0
-    around: FloatArray  # (n,), the mean of the six neighbours'
     places: FloatArray  # (n, 10 or 1), polynomials of place of which the gain is a sum
+    shaded: FloatArray  # (n, 11 or 2), I0 times these, and 1 for the offset
+    around: FloatArray  # the same of the mean of the six neighbours
     changes: FloatArray  # (n, 6), grad I0 . d for unit steps of the six unknowns
     scene: Image  # the loaded image, as coefficients of splines
     order: int  # of these splines
 
     def part(self, which: BoolArray) -> Self:
         """The same with some of the points, (n,)."""
-        names = ("points", "values", "around", "places", "changes")
+        names = ("points", "values", "places", "shaded", "around", "changes")
         return self if which.all() else replace(self, **{name: getattr(self, name)[which] for name in names})
+
+    @cached_property
+    def shading(self) -> "_Regression":
+        """Of the loaded image on the gain and the offset."""
+        return _Regression(self.shaded, self.around)
+
+    @cached_property
+    def moving(self) -> "_Regression":
+        """Of what remains on the six unknowns."""
+        return _Regression(self.changes, self.changes)
 
 
 class RigidFit:
@@ -146,8 +158,10 @@ class RigidFit:
         places = np.column_stack([np.ones(len(at)), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x])
         if self._radius_mm < _SHADED_MM:
             places = places[:, :1]
-        around, changes = convolve(fixed, _NEIGHBOURS, mode="nearest")[here], np.hstack([gradient, turning])
-        return _Level(blur_mm, points, fixed[here], around, places, changes, scene, 1 if blur_mm else 3)
+        mean = convolve(fixed, _NEIGHBOURS, mode="nearest")
+        shaded, around = (np.column_stack([places * i[here][:, None], np.ones(len(at))]) for i in (fixed, mean))
+        changes = np.hstack([gradient, turning])
+        return _Level(blur_mm, points, fixed[here], places, shaded, around, changes, scene, 1 if blur_mm else 3)
 
     def _settled(self, motion: RigidMotion, levels: list[_Level], parts: list[BoolArray]) -> RigidMotion:
         """Where steps over some of each level's points, one level after the other, come to rest."""
@@ -170,15 +184,13 @@ class RigidFit:
         if np.count_nonzero(shown) < _LEAST_SHOWN * len(shown):
             raise RegistrationError("The bone is moved out of the loaded image.")
         level, carried = level.part(shown), carried[shown]
-        values, places, changes = level.values, level.places, level.changes
+        values = level.values
         if not ((values - values.mean()) * (carried - carried.mean())).sum() > 0.0:
             raise RegistrationError("The contrast of the loaded image is inverted.")
-        both = values, level.around
-        columns, by = (np.column_stack([places * seen[:, None], np.ones(len(seen))]) for seen in both)
-        found = _regressed(columns, carried, by)
-        gain = np.einsum("ni,i->n", places, found[:-1])
+        found = level.shading.of(carried)
+        gain = np.einsum("ni,i->n", level.places, found[:-1])
         gain = np.maximum(gain, _LEAST_GAIN * carried.std() / values.std())
-        return _regressed(changes, values - (carried - found[-1]) / gain, changes)
+        return level.moving.of(values - (carried - found[-1]) / gain)
 
     def _step(self, step: FloatArray) -> RigidMotion:
         turn = Rotation.from_rotvec(step[3:] / self._radius_mm).as_matrix()
@@ -201,10 +213,15 @@ def _surrounded(image: Image, mask: Mask) -> Mask:
     return Mask(mask.grid, inside if few else surrounded)
 
 
-def _regressed(columns: FloatArray, on: FloatArray, by: FloatArray) -> FloatArray:
-    """Regression with instruments `by`, or the columns themselves; by sums whose bits do not depend on threads."""
-    normal, right = np.einsum("ni,nj->ij", by, columns), np.einsum("ni,n->i", by, on)
-    return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-9)[0])
+class _Regression:
+    """On columns (n, m), with instruments or by the columns themselves; sums whose bits do not depend on threads."""
+
+    def __init__(self, columns: FloatArray, by: FloatArray) -> None:
+        self._by, self._normal = by, np.einsum("ni,nj->ij", by, columns)
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """Coefficients (m,) of values (n,)."""
+        return np.asarray(np.linalg.lstsq(self._normal, np.einsum("ni,n->i", self._by, values), rcond=1e-9)[0])
 
 
 def _scenes(loaded: Image) -> dict[float, Image]:

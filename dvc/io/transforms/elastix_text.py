@@ -53,7 +53,10 @@ def format_parameters(parameters: Mapping[str, Sequence[Value]]) -> str:
     (Spacing 0.1 2)
     (UseDirectionCosines "true")
     """
-    return "".join(f"({name} {' '.join(_formatted(name, v) for v in values)})\n" for name, values in parameters.items())
+    return "".join(
+        f"({name} {' '.join(repr(v) if type(v) is float else _formatted(name, v) for v in values)})\n"
+        for name, values in parameters.items()
+    )
 
 
 def _formatted(name: str, value: Value) -> str:
