@@ -28,8 +28,7 @@ import numpy as np
 from dvc import Grid, LabelMap, TetMesh, plate_axes
 from dvc.trust.error_model import error_model_of
 from dvc.trust.truth_draws import TruthDraws
-from fe import LoadStep, NeoHooke, Plate, SolverOptions, Yeoh, cell_size_mm, problems_of, solve, variation
-from mrstrain.models.vary import COVERAGE, ORDER, SAFETY
+from fe import LoadStep, NeoHooke, Plate, SolverOptions, Yeoh, cell_size_mm, mesh_steps, problems_of, solve, variation
 from mrstrain.records.provenance import versions
 from validate import ALL, ALL_LOADS, FeResult, LoadCase, Variant, compare_load, rank_over_loads
 from validate.ranking import summed
@@ -170,7 +169,7 @@ def variants_of(laws, mesh: TetMesh, coarse: TetMesh) -> dict[str, list[Variant]
         tilted = solved(coarse, laws, variation.tilted(PLATE, SPREAD["direction_deg"], along=along))
         if tilted is not None:
             found[name] = tilted, 1.0, coarse
-    steps = COVERAGE * ((cell_size_mm(coarse) / cell_size_mm(mesh)) ** ORDER - 1.0) / SAFETY
+    steps = mesh_steps(cell_size_mm(coarse) / cell_size_mm(mesh))
     made: dict[str, list[Variant]] = {}
     for load in (x.name for x in LOADS):
         start = _on(coarse, base[load].u_mm)

@@ -1,4 +1,4 @@
-from .convergence import Limit, cell_size_mm, extrapolate
+from .convergence import ASSUMED_ORDER, SAFETY, SAFETY_WITHOUT_ORDER, Limit, cell_size_mm, extrapolate, mesh_steps
 from .decks import write_calculix, write_febio
 from .fitting import LAWS, Curve, Fit, fit, read_curves
 from .from_dvc import InputError, MrstrainError, OutputError, TetMesh, WorkerError
@@ -16,12 +16,13 @@ from .simulation_files import begin_simulation
 from .solution import LoadState, Observer, SolverOptions, solve
 
 __all__ = [
-    "BONE", "CUT", "LAWS", "MODES", "SKIN", "Checkpoint", "Curve", "Fit", "Hencky", "InputError", "Limit",
-    "LoadState", "LoadStep", "Material", "MaterialSet", "MeshQuality", "MrstrainError", "NeoHooke", "Observer",
-    "Ogden", "OutputError", "Plate", "PlateState", "Problem", "RegionFigures", "Simulation", "SolverOptions",
-    "TetMesh", "Tolerance", "WorkerError", "Yeoh", "as_toml", "begin_simulation", "cauchy_stress", "cell_size_mm",
-    "check_loads", "check_materials", "check_meshing", "equivalent_stress", "extrapolate", "fit", "fixed_facets",
-    "material_set", "mesh_labels", "paths_of", "problems_of", "published_names", "read_curves",
-    "read_material_sets", "read_tet_mesh", "region_figures", "simulate", "solve", "write_calculix", "write_febio",
-    "write_regions_csv", "write_state", "write_tet_mesh",
+    "ASSUMED_ORDER", "BONE", "CUT", "LAWS", "MODES", "SAFETY", "SAFETY_WITHOUT_ORDER", "SKIN", "Checkpoint", "Curve",
+    "Fit", "Hencky", "InputError", "Limit", "LoadState", "LoadStep", "Material", "MaterialSet", "MeshQuality",
+    "MrstrainError", "NeoHooke", "Observer", "Ogden", "OutputError", "Plate", "PlateState", "Problem",
+    "RegionFigures", "Simulation", "SolverOptions", "TetMesh", "Tolerance", "WorkerError", "Yeoh", "as_toml",
+    "begin_simulation", "cauchy_stress", "cell_size_mm", "check_loads", "check_materials", "check_meshing",
+    "equivalent_stress", "extrapolate", "fit", "fixed_facets", "material_set", "mesh_labels", "mesh_steps",
+    "paths_of", "problems_of", "published_names", "read_curves", "read_material_sets", "read_tet_mesh",
+    "region_figures", "simulate", "solve", "write_calculix", "write_febio", "write_regions_csv", "write_state",
+    "write_tet_mesh",
 ]  # fmt: skip

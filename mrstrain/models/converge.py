@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+import fe
 from dvc import read_labels
-from dvc.atomic_files import write_csv, write_json
+from dvc.atomic_files import write_csv, write_json, write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.measurement.subject import bones_of
 from dvc.own_files import read_json
@@ -15,6 +16,7 @@ from dvc.report.drawing import figure_files, save_figure
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
 from mrstrain.models.mesh import mesh as make_mesh
 from mrstrain.models.simulate import LOADS, simulate
+from mrstrain.models.variant_files import MESH, VARIANT, VariantRecord
 from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
@@ -23,6 +25,7 @@ from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import file_hash, provenance
 
 _FEWEST = 3
+_SHEAR = "maximum shear strain"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,8 @@ def converge(
         At least three edge lengths, mm.
     out : path
         Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and its figure, as PNG and
-        PDF. An existing mesh that was made from the same label map is reused.
+        PDF. An existing mesh that was made from the same label map is reused. The simulation on the second finest mesh
+        gets ``variant.toml``: `compare` takes it as the uncertainty of the finest mesh.
     loads, workers, progress
         As in `simulate`, with one material set.
 
@@ -106,7 +110,7 @@ def converge(
                 )  # fmt: skip
         sizes = np.array([cell_size_mm(read_tet_mesh(place)) for place in places.values()])
         extrapolate(sizes, sizes)  # refuses sizes that give no limit, before anything is simulated
-        values = []
+        values, simulated = [], list[Path]()
         for edge, place in places.items():
             made = simulate.with_options(
                 place, out=target / f"simulated-{edge:g}", simulation=options.SimulationOptions(sets=(material,)),
@@ -120,9 +124,11 @@ def converge(
                     f"Not every load was reached on the mesh with an edge length of {edge:g} mm. {reasons}"
                 )
             values.append(_followed(made.sets[0], region))
+            simulated.append(target / f"simulated-{edge:g}" / made.sets[0].name)
         on_meshes = {key: tuple(of[key] for of in values) for key in values[0]}
         rows = tuple(Row(*key, of, extrapolate(sizes, np.array(of))) for key, of in on_meshes.items())
         done = Converged(target, tuple(sizes.tolist()), rows)
+        _record_variant(done, *simulated[-2:])
         _write(done, edges, provenance("converge", inputs, {"edges_mm": edges, "material": material}))
     return done
 
@@ -131,7 +137,7 @@ def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], floa
     """Quantities compared between meshes, by load and name: plate displacement, and percentiles of the max. shear."""
     moved = {state.load.name: float(np.hypot(*state.plate_displacement_mm[:2])) for state in simulation.states}
     return {(load, "plate travel, mm"): travel for load, travel in moved.items()} | {
-        (row.load, f"maximum shear strain of {region}, p{percent}"): value
+        (row.load, f"{_SHEAR} of {region}, p{percent}"): value
         for row in simulation.regions
         if row.region == region
         for percent, value in ((50, row.shear_p50), (90, row.shear_p90), (99, row.shear_p99))
@@ -149,6 +155,14 @@ def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> 
         return bool(known == hashes and record["parameters"]["bones"] == list(bones))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
         return False
+
+
+def _record_variant(done: Converged, coarse: Path, fine: Path) -> None:
+    """Record the solution on the second finest mesh as a variant of that on the finest, by the order of the strain."""
+    orders = [row.limit.order for row in done.rows if row.figure.startswith(_SHEAR) and np.isfinite(row.limit.order)]
+    of_order = (float(np.median(orders)), fe.SAFETY) if orders else (fe.ASSUMED_ORDER, fe.SAFETY_WITHOUT_ORDER)
+    steps = fe.mesh_steps(done.sizes_mm[-2] / done.sizes_mm[-1], *of_order)
+    write_whole(coarse / VARIANT, VariantRecord.of_folders(fine.name, MESH, steps, fine, coarse).text)
 
 
 def _write(done: Converged, edges: Sequence[float], record: dict[str, object]) -> None:

@@ -12,6 +12,8 @@ from dvc.errors import InputError
 from dvc.tables import refuse_damaged_toml
 from mrstrain.options.model import Options, Real
 
+MESH = "mesh"
+"""Name of the input that stands for the mesh."""
 VARIANT = "variant.toml"
 """File in the folder of a variant: model, input, steps, and optionally the folder of the solution that it is compared
 with (base), relative to its own."""

@@ -17,17 +17,13 @@ from dvc.worker import Worker
 from fe import variation
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint
 from mrstrain.models.simulate import material_sets, simulate
-from mrstrain.models.variant_files import VARIANT, VariantRecord
+from mrstrain.models.variant_files import MESH, VARIANT, VariantRecord
 from mrstrain.options import modelling as options
 from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.outcome import Outcome
 
-MESH = "mesh"
-ORDER, SAFETY, COVERAGE = 1.0, 1.25, 2.0
-"""Of the mesh: assumed order of the strain in linear cells, safety factor, and coverage factor of the expanded
-uncertainty SAFETY |f_fine - f_coarse| / (r^ORDER - 1), with the ratio r of the cell sizes."""
 _LEAST_RATIO = 1.1  # of cell sizes
 _SHORT = 0.2  # of the time of a whole solution: one that starts from the state of another
 _SKIN = "skin"
@@ -210,7 +206,7 @@ def _record_mesh(folder: Path, name: str, fine: TetMesh, coarse: TetMesh) -> str
     if ratio < _LEAST_RATIO:
         (folder / VARIANT).unlink(missing_ok=True)
         return f"{told}; below {_LEAST_RATIO:g} no error of the mesh can be estimated."
-    steps = COVERAGE * (ratio**ORDER - 1.0) / SAFETY
+    steps = fe.mesh_steps(ratio)
     _record(folder, name, MESH, steps, None)
     return f"{told}; one standard uncertainty is {1.0 / steps:.1f} times the difference of the two solutions."
 

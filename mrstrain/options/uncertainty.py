@@ -35,7 +35,7 @@ class Uncertainty(Options):
     labels_voxels: NotNegative = 0.0
     """Of the boundary of the bone and of the inner surface of the skin, in voxels of the label map that is meshed."""
     variants: Annotated[tuple[Path, ...], AfterValidator(_different)] = ()
-    """Folders with variants of the models of other codes, each with a ``variant.toml``."""
+    """Folders with further variants of models, each with a ``variant.toml``: of other codes, or from `converge`."""
     quick: Flag = False
     """Skip the variants."""
 
