@@ -13,16 +13,16 @@ from phantoms.bodies import EllipsoidUnion
 from phantoms.compiled import at_point
 
 _NOTHING = 27.0  # exp(-27) = 2e-12: a rise is complete beyond
+_NO_GRADIENT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @at_point
 def _rise(x, y, z, parts, numbers, side, q):  # type: ignore[no-untyped-def]
     """Return chi = 1 - exp(-t^order), t = side (sqrt(Q) - 1) / ramp, its gradient, and its Hessian (xx xy xz yy yz zz).
 
-    side is 1 outside the body and -1 inside it; on the other side chi is 0.
+    side is 1 outside the body and -1 inside it; on the other side chi is 0. q is room to work in.
     """
-    sharpness, ramp, order = numbers[0], numbers[1], numbers[2]
-    end = np.sqrt(_NOTHING) if order == 2.0 else np.cbrt(_NOTHING)
+    sharpness, ramp, order, end, below = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     all_of_it = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     count = parts.shape[0]
@@ -35,7 +35,7 @@ def _rise(x, y, z, parts, numbers, side, q):  # type: ignore[no-untyped-def]
     if side > 0.0:
         if least <= 1.0:  # Q is below the least q
             return nothing
-        if least - np.log(count) / sharpness >= (1.0 + end * ramp) ** 2:
+        if least - below >= (1.0 + end * ramp) ** 2:
             return all_of_it
     elif least <= max(0.0, 1.0 - end * ramp) ** 2:
         return all_of_it
@@ -88,23 +88,22 @@ def _rise(x, y, z, parts, numbers, side, q):  # type: ignore[no-untyped-def]
 
 
 @at_point
-def _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q):  # type: ignore[no-untyped-def]
-    """Write the velocity at p into v and its gradient into L; q is room to work in."""
-    v[:] = 0.0
-    L[:, :] = 0.0
+def _velocity(x, y, z, rest, skin, window, plate, pivot, keeps, q):  # type: ignore[no-untyped-def]
+    """Velocity at a point, and the rows of its gradient; q is room to work in."""
+    still = (0.0, 0.0, 0.0), _NO_GRADIENT
     # The window w = exp(-s / 2), its gradient w * e, its Hessian w * (e e^T - diag(f)).
-    f0, f1, f2 = window[1, 0] ** -2, window[1, 1] ** -2, window[1, 2] ** -2
-    e0, e1, e2 = (window[0, 0] - p[0]) * f0, (window[0, 1] - p[1]) * f1, (window[0, 2] - p[2]) * f2
+    f0, f1, f2 = window[1, 0], window[1, 1], window[1, 2]
+    e0, e1, e2 = (window[0, 0] - x) * f0, (window[0, 1] - y) * f1, (window[0, 2] - z) * f2
     s = e0 * e0 / f0 + e1 * e1 / f1 + e2 * e2 / f2
     if s > 2.0 * _NOTHING:
-        return
-    chi, g0, g1, g2, h00, h01, h02, h11, h12, h22 = _rise(p[0], p[1], p[2], rest[0], rest[1], 1.0, q)
+        return still
+    chi, g0, g1, g2, h00, h01, h02, h11, h12, h22 = _rise(x, y, z, rest[0], rest[1], 1.0, q)
     if chi == 0.0:
-        return
+        return still
     if skin[0].shape[0]:
-        k, j0, j1, j2, k00, k01, k02, k11, k12, k22 = _rise(p[0], p[1], p[2], skin[0], skin[1], -1.0, q)
+        k, j0, j1, j2, k00, k01, k02, k11, k12, k22 = _rise(x, y, z, skin[0], skin[1], -1.0, q)
         if k == 0.0:
-            return
+            return still
         h00 = chi * k00 + 2.0 * g0 * j0 + k * h00
         h01 = chi * k01 + g0 * j1 + g1 * j0 + k * h01
         h02 = chi * k02 + g0 * j2 + g2 * j0 + k * h02
@@ -119,11 +118,8 @@ def _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q):  # type: ign
     c0, c1, c2 = plate[0], plate[1], plate[2]
     if not keeps:
         g0, g1, g2 = w * (g0 + chi * e0), w * (g1 + chi * e1), w * (g2 + chi * e2)
-        v[0], v[1], v[2] = chi * w * c0, chi * w * c1, chi * w * c2
-        L[0, 0], L[0, 1], L[0, 2] = c0 * g0, c0 * g1, c0 * g2
-        L[1, 0], L[1, 1], L[1, 2] = c1 * g0, c1 * g1, c1 * g2
-        L[2, 0], L[2, 1], L[2, 2] = c2 * g0, c2 * g1, c2 * g2
-        return
+        moved = chi * w * c0, chi * w * c1, chi * w * c2
+        return moved, (c0 * g0, c0 * g1, c0 * g2, c1 * g0, c1 * g1, c1 * g2, c2 * g0, c2 * g1, c2 * g2)
     h00 = w * (h00 + 2.0 * g0 * e0 + chi * (e0 * e0 - f0))
     h11 = w * (h11 + 2.0 * g1 * e1 + chi * (e1 * e1 - f1))
     h22 = w * (h22 + 2.0 * g2 * e2 + chi * (e2 * e2 - f2))
@@ -132,10 +128,10 @@ def _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q):  # type: ign
     h12 = w * (h12 + g1 * e2 + g2 * e1 + chi * e1 * e2)
     g0, g1, g2 = w * (g0 + chi * e0), w * (g1 + chi * e1), w * (g2 + chi * e2)
 
-    r0, r1, r2 = p[0] - pivot[0], p[1] - pivot[1], p[2] - pivot[2]
+    r0, r1, r2 = x - pivot[0], y - pivot[1], z - pivot[2]
     along = 0.5 * (g0 * c0 + g1 * c1 + g2 * c2)
     share = chi * w + 0.5 * (g0 * r0 + g1 * r1 + g2 * r2)
-    v[0], v[1], v[2] = c0 * share - r0 * along, c1 * share - r1 * along, c2 * share - r2 * along
+    moved = c0 * share - r0 * along, c1 * share - r1 * along, c2 * share - r2 * along
     # Rows of L = c (x) (3 g + H r) / 2 - r (x) (H c) / 2 - I (g . c) / 2
     m0 = 1.5 * g0 + 0.5 * (h00 * r0 + h01 * r1 + h02 * r2)
     m1 = 1.5 * g1 + 0.5 * (h01 * r0 + h11 * r1 + h12 * r2)
@@ -143,52 +139,72 @@ def _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q):  # type: ign
     n0 = 0.5 * (h00 * c0 + h01 * c1 + h02 * c2)
     n1 = 0.5 * (h01 * c0 + h11 * c1 + h12 * c2)
     n2 = 0.5 * (h02 * c0 + h12 * c1 + h22 * c2)
-    L[0, 0], L[0, 1], L[0, 2] = c0 * m0 - r0 * n0 - along, c0 * m1 - r0 * n1, c0 * m2 - r0 * n2
-    L[1, 0], L[1, 1], L[1, 2] = c1 * m0 - r1 * n0, c1 * m1 - r1 * n1 - along, c1 * m2 - r1 * n2
-    L[2, 0], L[2, 1], L[2, 2] = c2 * m0 - r2 * n0, c2 * m1 - r2 * n1, c2 * m2 - r2 * n2 - along
+    return moved, (
+        c0 * m0 - r0 * n0 - along, c0 * m1 - r0 * n1, c0 * m2 - r0 * n2,
+        c1 * m0 - r1 * n0, c1 * m1 - r1 * n1 - along, c1 * m2 - r1 * n2,
+        c2 * m0 - r2 * n0, c2 * m1 - r2 * n1, c2 * m2 - r2 * n2 - along,
+    )  # fmt: skip
+
+
+@at_point
+def _grown(L, M):  # type: ignore[no-untyped-def]
+    """L + L M, of matrices by their rows."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = L
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = M
+    return (
+        a0 + a0 * b0 + a1 * b3 + a2 * b6, a1 + a0 * b1 + a1 * b4 + a2 * b7, a2 + a0 * b2 + a1 * b5 + a2 * b8,
+        a3 + a3 * b0 + a4 * b3 + a5 * b6, a4 + a3 * b1 + a4 * b4 + a5 * b7, a5 + a3 * b2 + a4 * b5 + a5 * b8,
+        a6 + a6 * b0 + a7 * b3 + a8 * b6, a7 + a6 * b1 + a7 * b4 + a8 * b7, a8 + a6 * b2 + a7 * b5 + a8 * b8,
+    )  # fmt: skip
+
+
+@at_point
+def _plus(A, share, B):  # type: ignore[no-untyped-def]
+    """A + share B, of matrices by their rows."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = A
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = B
+    return (
+        a0 + share * b0, a1 + share * b1, a2 + share * b2, a3 + share * b3, a4 + share * b4,
+        a5 + share * b5, a6 + share * b6, a7 + share * b7, a8 + share * b8,
+    )  # fmt: skip
 
 
 @njit(nogil=True, cache=True)
 def _carry(start, stop, points, rest, skin, window, plate, pivot, keeps, steps, u, F1):  # type: ignore[no-untyped-def]
-    """Runge-Kutta 4 on x' = v(x) and, with it, on (F - I)' = grad v F."""
+    """Runge-Kutta 4 on x' = v(x) and, with it, on (F - I)' = grad v F.
+
+    Numbers of one point are no arrays: these took two thirds of the time.
+    """
     h = 1.0 / steps
-    nodes = np.array([0.0, 0.5 * h, 0.5 * h, h])
-    shares = np.array([h / 6.0, h / 3.0, h / 3.0, h / 6.0])
-    most = max(rest[0].shape[0], skin[0].shape[0])
-    v, L, p, du, q = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(most)
-    M, K, dM = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    nodes, shares = (0.0, 0.5 * h, 0.5 * h, h), (h / 6.0, h / 3.0, h / 3.0, h / 6.0)
+    q = np.zeros(max(rest[0].shape[0], skin[0].shape[0]))
     gradient = F1.shape[0] > 0
     for n in range(start, stop):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        u0, u1, u2, M = 0.0, 0.0, 0.0, _NO_GRADIENT  # F - I
         for _ in range(steps):
-            du[:] = 0.0
-            dM[:, :] = 0.0
-            v[:] = 0.0
-            K[:, :] = 0.0
+            d0, d1, d2, v0, v1, v2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            K, dM = _NO_GRADIENT, _NO_GRADIENT
             moving = False
             for stage in range(4):
-                for i in range(3):
-                    p[i] = points[n, i] + u[n, i] + nodes[stage] * v[i]
+                to, share = nodes[stage], shares[stage]
+                (v0, v1, v2), L = _velocity(
+                    x + u0 + to * v0, y + u1 + to * v1, z + u2 + to * v2, rest, skin, window, plate, pivot, keeps, q
+                )
+                d0, d1, d2 = d0 + share * v0, d1 + share * v1, d2 + share * v2
+                moving = moving or v0 != 0.0 or v1 != 0.0 or v2 != 0.0
                 if gradient:
-                    for i in range(3):
-                        for j in range(3):
-                            M[i, j] = F1[n, i, j] + nodes[stage] * K[i, j]
-                _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q)
-                for i in range(3):
-                    du[i] += shares[stage] * v[i]
-                    moving = moving or v[i] != 0.0
-                if gradient:
-                    for i in range(3):
-                        for j in range(3):
-                            K[i, j] = L[i, j] + L[i, 0] * M[0, j] + L[i, 1] * M[1, j] + L[i, 2] * M[2, j]
-                            dM[i, j] += shares[stage] * K[i, j]
+                    K = _grown(L, _plus(M, to, K))
+                    dM = _plus(dM, share, K)
             if not moving:
                 break  # a point of a stationary flow that is at rest stays at rest
+            u0, u1, u2 = u0 + d0, u1 + d1, u2 + d2
+            M = _plus(M, 1.0, dM)
+        u[n, 0], u[n, 1], u[n, 2] = u0, u1, u2
+        if gradient:
             for i in range(3):
-                u[n, i] += du[i]
-            if gradient:
-                for i in range(3):
-                    for j in range(3):
-                        F1[n, i, j] += dM[i, j]
+                for j in range(3):
+                    F1[n, i, j] = M[3 * i + j]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,14 +231,18 @@ class Border:
             raise InputError(f"`ramp` must be above 0 and `order` 2 or 3; got {self.ramp} and {self.order}.")
 
     def _numbers(self) -> tuple[FloatArray, FloatArray]:
-        """Per ellipsoid its centre and its form's xx, xy, xz, yy, yz, zz, (n, 9); then sharpness, ramp and order."""
+        """Per ellipsoid its centre and its form's xx, xy, xz, yy, yz, zz, (n, 9); then five numbers.
+
+        Sharpness, ramp, order, the t at which the rise is complete, and how far Q may be below the least q.
+        """
         body = self.body
         upper = body.forms[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         parts = np.ascontiguousarray(np.concatenate([body.centres_mm, upper], axis=1))
-        return parts, np.array([body.sharpness, self.ramp, float(self.order)])
+        end, below = _NOTHING ** (1.0 / self.order), np.log(len(parts)) / body.sharpness
+        return parts, np.array([body.sharpness, self.ramp, float(self.order), end, below])
 
 
-_NO_BORDER = (np.zeros((0, 9)), np.ones(3))
+_NO_BORDER = (np.zeros((0, 9)), np.ones(5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,7 +305,7 @@ class Flow:
 
     def _follow(self, points_mm: FloatArray, gradient: bool) -> tuple[FloatArray, FloatArray]:
         points = as_points(points_mm)
-        window = np.array([self.centre_mm, self.width_mm])
+        window = np.array([self.centre_mm, self.width_mm**-2.0])
         skin = _NO_BORDER if self.skin is None else self.skin._numbers()
         u, H = np.zeros((len(points), 3)), np.zeros((len(points) if gradient else 0, 3, 3))
         in_parts(
