@@ -51,9 +51,10 @@ def tell_where_mkl_is() -> None:
 
 class _Pardiso:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
+        tell_where_mkl_is()  # before the import, which makes a solver
+
         from pypardiso import PyPardisoSolver
 
-        tell_where_mkl_is()
         self.rough, self.size = rough, len(indptr) - 1
         self._kind = np.float32 if rough else np.float64
         self._pattern = [np.asarray(of + 1, dtype=np.int32) for of in (indptr, indices)]  # counted from 1

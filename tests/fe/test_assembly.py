@@ -3,6 +3,7 @@
 import importlib.util
 import math
 import os
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -304,6 +305,16 @@ def test_a_library_says_when_a_matrix_is_singular(library: str) -> None:
 
     with pytest.raises(SingularError, match="cannot be factorised"):
         solved()
+
+
+@needs_mkl
+def test_the_place_of_mkl_is_known_before_pypardiso_is_imported_and_searches(monkeypatch) -> None:
+    imported = list[bool]()
+    monkeypatch.setattr("fe.linear.tell_where_mkl_is", lambda: imported.append("pypardiso" in sys.modules))
+    for name in [name for name in sys.modules if name.split(".")[0] == "pypardiso"]:
+        monkeypatch.delitem(sys.modules, name)
+    factors(np.array([0, 1, 2]), np.array([0, 1]), threads=1, rough=False).close()
+    assert imported == [False]
 
 
 @needs_mkl
