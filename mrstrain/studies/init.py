@@ -11,8 +11,7 @@ import jinja2
 from dvc import read_image, read_labels
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, OutputError
-from dvc.io.images.dicom import is_multiframe
-from dvc.io.images.stored import is_dicom
+from dvc.io.images.dicom import is_dicom, is_multiframe
 from dvc.measurement.subject import is_bones_name
 from fe import BONE, published_names
 from mrstrain.comparison.model_files import ENDINGS

@@ -14,7 +14,7 @@ from dvc.arrays import Float32Array
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid
 from dvc.io.images.dicom_frames import CONVERT, STACK, TIME_POINT, Frame, Labels, read_frames, read_values
-from dvc.io.images.stored import MAX_BYTES, is_dicom, refuse_if_too_large
+from dvc.io.images.stored import MAX_BYTES, refuse_if_too_large
 
 _log = logging.getLogger("dvc.images")
 
@@ -23,6 +23,12 @@ _SAME_PLACE_MM = 0.01
 _SAME_DIRECTION = 1e-3
 _LISTED = 40
 _SEVERAL = "several echoes, image types, orientations, stacks or time points"
+
+
+def is_dicom(path: Path) -> bool:
+    """Whether a file looks like DICOM, from its first bytes or its suffix."""
+    with path.open("rb") as file:
+        return file.read(132)[128:] == b"DICM" or path.suffix.lower() in (".dcm", ".ima")
 
 
 def is_multiframe(path: Path) -> bool:

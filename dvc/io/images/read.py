@@ -10,8 +10,9 @@ from dvc.arguments import checked
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
 from dvc.io import StrPath
+from dvc.io.images.dicom import is_dicom, read_dicom
 from dvc.io.images.nifti import read_nifti_header
-from dvc.io.images.stored import MAX_BYTES, StoredVolume, Voxels, is_dicom
+from dvc.io.images.stored import MAX_BYTES, StoredVolume, Voxels
 from dvc.io.images.text_headers import read_meta_header, read_nrrd_header
 
 _log = logging.getLogger("dvc.images")
@@ -89,8 +90,6 @@ def read_voxels(
     if not place.exists():
         raise InputError(f"{place}: no such file or folder. Check the path.")
     if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):
-        from dvc.io.images.dicom import read_dicom  # with it comes pydicom: 0.2 s
-
         if volume is not None:
             raise InputError(f"{place}: volume={volume} is for 4D files; for DICOM use series.")
         return read_dicom(place, series=series, max_bytes=max_bytes)

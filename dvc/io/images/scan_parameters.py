@@ -19,7 +19,8 @@ from typing import Any
 
 from dvc.errors import ImageFileError
 from dvc.io import StrPath
-from dvc.io.images.stored import is_dicom
+from dvc.io.images.dicom import is_dicom
+from dvc.io.images.dicom_frames import damage_named
 from dvc.own_files import read_json
 
 _MAKERS = {
@@ -150,8 +151,6 @@ def _of_sidecar(place: Path) -> dict[str, Any]:
 def _of_dicom(place: Path) -> dict[str, Any]:
     """Elements of the first image of a file or folder."""
     import pydicom
-
-    from dvc.io.images.dicom_frames import damage_named
 
     files = sorted(p for p in place.iterdir() if p.is_file()) if place.is_dir() else [place]
     for path in (one for one in files if not one.name.startswith(".") and is_dicom(one)):

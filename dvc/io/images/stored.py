@@ -147,12 +147,6 @@ def grid_of_axes(
         raise ImageFileError(f"{path}: {error}") from error
 
 
-def is_dicom(path: Path) -> bool:
-    """Whether a file looks like DICOM, from its first bytes or its suffix."""
-    with path.open("rb") as file:
-        return file.read(132)[128:] == b"DICM" or path.suffix.lower() in (".dcm", ".ima")
-
-
 def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> None:
     """Refuse an image that takes more than `max_bytes` in single precision, or has a size that is not positive."""
     sizes = [int(n) for n in shape]
