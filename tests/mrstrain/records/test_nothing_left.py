@@ -99,6 +99,12 @@ REFUSED: dict[str, tuple[str, Give]] = {
         "bone's motion cannot be removed",
         lambda out, files: mrstrain.strain(
             LOAD0, displacement(files, 1.0), out=out, frame="LPS", bone=bone(files, voxels=1))),
+    "strain, a mesh elsewhere": (
+        "no node is inside the unloaded image",
+        lambda out, files: mrstrain.strain(
+            LOAD0, displacement(files, 1.0), out=out, **WARPED, **PAD, mesh_frame="RAS"
+        ),
+    ),
     "twin, folds": ("fold", lambda out, files: mrstrain.twin(LOAD0, displacement(files, 40.0), out=out, **WARPED)),
     "label, bone of one voxel": (
         "has only 1 of the image's voxels",
