@@ -28,14 +28,14 @@ PAD = {"mesh": GIVEN / "pad.inp"}
 EDGES_MM = [4.0, 5.0, 6.0]
 
 
-def bone(files: Path, *, voxels: int = 0) -> Path:
-    """A mask on the grid of the unloaded image: so many voxels of bone, or a block in the air."""
+def bone(files: Path, *, voxels: int = 0, whole: bool = False) -> Path:
+    """A mask on the grid of the unloaded image: all of it, so many voxels of bone, or a block in the air."""
     tissues = nibabel.load(TISSUES["labels"])
     labels = np.asarray(tissues.dataobj)
-    inside = np.zeros(labels.shape, dtype=np.uint8)
+    inside = np.full(labels.shape, whole, dtype=np.uint8)
     if voxels:
         inside[tuple(np.argwhere(labels == 1)[:voxels].T)] = 1
-    else:
+    elif not whole:
         image = np.asarray(nibabel.load(LOAD0).dataobj)
         inside[tuple(np.argwhere((labels == 0) & (image < np.percentile(image, 20)))[:400].T)] = 1
     nibabel.save(nibabel.Nifti1Image(inside, tissues.affine, tissues.header), files / "bone.nii.gz")
@@ -88,6 +88,10 @@ REFUSED: dict[str, tuple[str, Give]] = {
     "register, bone in the air": (
         "rigid alignment on the bone failed",
         lambda out, files: mrstrain.register(LOAD0, [LOAD1], out=out, bone=bone(files), workers=1)),
+    "register, the whole image as bone": (
+        "The bone mask covers 100% of the body, so there is no soft tissue",
+        lambda out, files: mrstrain.register(LOAD0, [LOAD1], out=out, bone=bone(files, whole=True), workers=1),
+    ),
     "register, no such label": (
         "no region 'talus'",
         lambda out, files: mrstrain.register(LOAD0, [LOAD1], out=out, **TISSUES, bone_label="talus")),
