@@ -21,6 +21,7 @@ from fe.mesh_file import BONE, SKIN
 from fe.plate import Contact, Plate
 
 _MOST_STIFFNESSES = 1000.0  # largest pressure, in shear moduli: free neo-Hookean tissue keeps 3 % of its thickness
+_LIQUID_MPA = 1e-6  # shear modulus: 1 cm of tissue as soft sinks by half a metre under its own weight
 _UNUSUAL_MPA = 1.0  # peak pressure under the heel of a runner
 _SLIGHT_MPA = 5e-5  # the weight of 5 mm of tissue
 _SLIGHT = 1e-3  # displacement over the size of the body
@@ -289,7 +290,14 @@ def _unusual(mesh: TetMesh, materials: Materials, plate: Plate, load: LoadStep) 
 
 @checked
 def check_materials(mesh: TetMesh, materials: Materials) -> None:
-    """InputError unless a mesh has every cell only once, and every cell has exactly one material."""
+    """InputError unless a mesh has every cell only once, and every cell has exactly one material that is no liquid."""
+    for region, material in materials.items():
+        if material.shear_modulus_mpa < _LIQUID_MPA:
+            raise InputError(
+                f"The material of {region} has a shear modulus of {1e6 * material.shear_modulus_mpa:.3g} Pa, like a "
+                "liquid: no equilibrium would be found. Moduli are in MPa, or in kPa where the name says so; check "
+                "them."
+            )
     if len(again := repeated_rows(np.sort(mesh.cells, axis=1))):
         first = ", ".join(map(str, again[:_NAMED])) + (" ..." if len(again) > _NAMED else "")
         raise InputError(

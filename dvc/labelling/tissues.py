@@ -25,6 +25,7 @@ NAMES = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
 _DARK = 0.7  # of muscle's brightness: darker are cortical bone and tendon
 _SURE = 0.9
 _LEAST_IN_BODY = 0.5  # of the bone
+_LEAST_BONE = 16  # voxels
 _DARK_MARROW = 0.25  # of the step from muscle to fat: 0.5 and more in phantoms with slices of up to 3 mm
 
 
@@ -84,8 +85,8 @@ def label_tissues(
     Raises
     ------
     InputError
-        If neither a bone nor the mark of one is given, a bone or its mark is not where it can be, or no soft tissue is
-        left.
+        If neither a bone nor the mark of one is given, a bone has fewer than 16 voxels, it or its mark is not where it
+        can be, or no soft tissue is left.
     GeometryError
         If a mask does not lie on the image.
     """
@@ -94,6 +95,11 @@ def label_tissues(
     if bone is None and not any(map(is_bones_name, marked)):
         raise InputError("Labels need the mask of a bone (bone), or the mark of one, such as 'calcaneus' (marks).")
     known = np.zeros(grid.shape, dtype=bool) if bone is None else fit_mask(bone, grid, "bone").inside
+    if known.any() and (count := int(known.sum())) < _LEAST_BONE:
+        raise InputError(
+            f"The mask of the bone (bone) has only {count} of the image's voxels; a bone has thousands. Give the whole "
+            "bone, or mark a few of its voxels (marks)."
+        )
     whole = (tissue_mask(image) if body is None else fit_mask(body, grid, "body")).inside
     soft = whole & ~known
     if not soft.any():

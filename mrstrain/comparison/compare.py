@@ -26,7 +26,7 @@ from mrstrain.options.door import door
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
 from mrstrain.records.doctor import usable_memory_bytes
-from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, output_folder, refuse_touching_inputs
 from mrstrain.records.progress import NOTE, OnProgress
 from mrstrain.records.provenance import provenance
 
@@ -140,8 +140,7 @@ def compare(
     with side_by_side("comparing", _at_once(len(cases))) as each:
         # Every file is read once before anything is removed, and again when needed: together they would fill memory.
         warnings = validate.check_models(cases, tissues, bones, each=each)
-        make_output(target)
-        with alone(target):
+        with output_folder(target), alone(target):
             record = provenance("compare", inputs, given)
             result = validate.compare(
                 cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings, progress=share,

@@ -9,7 +9,7 @@ from mrstrain.measurement.answer import measured_strain
 from mrstrain.measurement.case import Case, Series
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
-from mrstrain.records.inputs import alone, case_names, make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.inputs import alone, case_names, output_folder, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
 _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
@@ -63,8 +63,7 @@ def strain(
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
     refuse_touching_inputs(target, [name], [source, *subject.files.values()])
     measured = dvc.Measurement.from_deformation(total, subject, name=name)
-    make_output(target)
-    with alone(target):
+    with output_folder(target), alone(target):
         case = Case.of(measured, target / name, record)
         first = measured_strain([case.section], subject, {name: case.folder}, target)
         return Series.of(target, (case,), {}, record, first)

@@ -20,7 +20,7 @@ from mrstrain.models.variant_files import MESH, VARIANT, VariantRecord
 from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
-from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, output_folder, refuse_touching_inputs
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import file_hash, provenance
 
@@ -91,7 +91,6 @@ def converge(
         raise InputError(f"Mesh convergence needs at least {_FEWEST} different edge lengths; got {len(edges)}.")
     inputs = {"labels": [Path(labels)], **labelling.files}
     refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], [Path(labels), *labelling.paths])
-    make_output(target)
     tell, region, material = progress or (lambda *_: None), followed.region, followed.material
     tissues = read_labels(labels, labelling.names)
     known, bones = list(tissues.names.values()), bones_of(tissues, labelling.bones)
@@ -100,7 +99,7 @@ def converge(
         raise InputError(f"The label map has no soft tissue '{region}'; it has {', '.join(known)}.")
     # an unsuitable material set is refused before hours of meshing
     material_set(material).for_regions([name for name in known if name not in bones])
-    with alone(target):
+    with output_folder(target), alone(target):
         places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
         for edge, place in places.items():
             if not _is_of(place, inputs, bones):

@@ -10,7 +10,7 @@ from dvc.atomic_files import write_csv, write_json, write_whole
 from dvc.report.drawing import save_figure
 from fe import Fit, Material, Ogden, as_toml, figures, read_curves
 from fe.hyperelastic import OGDEN
-from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
+from mrstrain.records.inputs import alone, output_folder, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
 _FILES = ["fit.json", "fit.csv", "fit.png", "fit.pdf", "material.toml"]
@@ -99,7 +99,6 @@ def fit(
     curves = read_curves(path, test)
     fitted = fe.fit(curves, law, nu)
     refuse_touching_inputs(target, _FILES, [path])
-    make_output(target)
     about = {
         "material": fitted.material.description,
         "others": [other.description for other in fitted.others],
@@ -116,7 +115,7 @@ def fit(
     source = f"{law} fitted to {path.name}"
     if at_bound := [p.name for p in fitted.parameters if p.at_bound]:
         source += f", which does not determine {', '.join(at_bound)}"
-    with alone(target):
+    with output_folder(target), alone(target):
         write_json(target / "fit.json", asdict(fitted) | about)
         write_csv(target / "fit.csv", ("test", "stretch", "nominal_stress_kpa", "fitted_kpa"), rows)
         save_figure(target / "fit", figures.stress_stretch(curves, fitted))

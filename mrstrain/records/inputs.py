@@ -17,6 +17,7 @@ from dvc.file_names import clash, refuse_as_file_name
 from dvc.io.images.write import refuse_overwriting_inputs
 from dvc.io.result_folder import REPORT
 from dvc.measurement.subject import LabelsFromImage, plate_directions
+from dvc.mesh import box_told
 from dvc.own_files import read_json
 from mrstrain.options.measurement import AUTO, MADE_LABELS, MeshAndAxes, SubjectFiles
 from mrstrain.records.provenance import file_hash
@@ -46,11 +47,10 @@ def read_subject(
     if onto.mesh is not None:
         mesh = read_mesh(onto.mesh, unit=onto.mesh_unit, frame=onto.mesh_frame)
         if not reference.grid.contains(mesh.points_mm).any():
-            low, high = mesh.bounds_mm
+            own, of_image = box_told(*mesh.bounds_mm), box_told(*reference.grid.bounds_mm())
             raise InputError(
-                f"{onto.mesh}: no node is inside the unloaded image. The mesh spans {np.round(low, 1).tolist()} to "
-                f"{np.round(high, 1).tolist()} mm (LPS); the image: {reference.grid}. Check mesh_unit and "
-                "mesh_frame."
+                f"{onto.mesh}: no node is inside the unloaded image. The mesh spans {own} mm; the image {of_image} mm "
+                "(LPS). Check mesh_unit and mesh_frame."
             )
     normal, axes = plate_directions(onto.plate_normal, onto.shear_direction)
     given = {role: paths[0] for role, paths in {"load0": [Path(load0)], **files.files, **onto.files}.items()}

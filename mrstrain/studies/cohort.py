@@ -13,7 +13,7 @@ from dvc.own_files import read_rows
 from dvc.report.drawing import Drawing
 from dvc.report.page import Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
-from mrstrain.records.inputs import alone, make_output
+from mrstrain.records.inputs import alone, output_folder
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
@@ -85,12 +85,11 @@ def cohort(
             f"A cohort needs studies with different names ([study] name); got {', '.join(names) or 'none'}."
         )
     target = Path(out)
-    make_output(target)
     ranges = {study.compare.strains for study in read}
     if len(ranges) > 1:
         raise InputError(f"The studies have different ranges of strain ([compare] strains): {sorted(ranges)}.")
     refuse_other_laws(read)
-    with alone(target):
+    with output_folder(target), alone(target):
         ran = run_studies(read, scheduler=scheduler, workers=workers, follower=Follower(progress))
         files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
         return _ranked(dict(zip(names, ran, strict=True)), target, files)

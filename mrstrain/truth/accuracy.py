@@ -15,7 +15,7 @@ from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
-from mrstrain.records.inputs import alone, make_output, refuse_small_disk
+from mrstrain.records.inputs import alone, output_folder, refuse_small_disk
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 from mrstrain.truth.accuracy_study import AccuracyStudy
@@ -104,7 +104,6 @@ def accuracy(
     _refuse_one_name_for_two([*(run.case for run in runs.values()), *wanted])
     missing = [case for case in wanted if case.name not in runs]
     refuse_small_disk(target, len(missing) * _MEGABYTES * 1e6 + 20e6, "the study needs", ", or a smaller study")
-    make_output(target)
     at_once = max(1, min(workers or usable_cores(), len(missing)))
     if tell_plan is not None:
         minutes = max(expected_minutes(missing, at_once), 1.0) if missing else 0.0
@@ -112,8 +111,7 @@ def accuracy(
             f"Registrations to run: {len(missing)}, {at_once} at a time, in about {minutes:.0f} min; "
             f"already done: {len(wanted) - len(missing)}."
         )
-    with alone(target):
-        folder.mkdir(exist_ok=True)
+    with output_folder(folder), alone(target):
         failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
         if not runs:
             raise MrstrainError(with_reasons("No case could be measured.", [f"{n}: {r}" for n, r in failures.items()]))

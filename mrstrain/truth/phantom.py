@@ -15,7 +15,7 @@ from dvc.io.result_folder import PROVENANCE, REGIONS, write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.options.door import door
 from mrstrain.options.modelling import HeelShape
-from mrstrain.records.inputs import alone, make_output, refuse_small_disk
+from mrstrain.records.inputs import alone, output_folder, refuse_small_disk
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from phantoms import LOADS, Heel, covering, heel_grid, labels_of, labels_to_mesh, random_foot_motion, scan, under_load
@@ -88,11 +88,10 @@ def phantom(
     target = Path(out)
     needed = _BYTES_PER_VOXEL * int(np.prod(grid.shape)) * (len(motions) + 2)
     refuse_small_disk(target, needed, "the images need", ", larger voxels or fewer loads")
-    make_output(target)
     parameters = {"seed": seed, "spacing_mm": np.broadcast_to(spacing_mm, 3).tolist(), "snr": snr, **shape.plain()}
     parameters["loads_press_shear_slide_mm"] = {load: LOADS[load] for load in motions}
     record = provenance("phantom", {}, parameters)
-    with alone(target):
+    with output_folder(target), alone(target):
         images = _write_images(target, heel, grid, snr, motions, record, progress or (lambda *_: None))
         write_json(target / "phantom.json", record)
     return PhantomFiles(target, images)

@@ -9,7 +9,7 @@ from dvc.io.result_folder import PROVENANCE
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, SubjectFiles
-from mrstrain.records.inputs import alone, make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.inputs import alone, output_folder, read_subject, refuse_touching_inputs
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
@@ -52,8 +52,7 @@ def twin(
     record = provenance("twin", {**subject.files, "deformation": source}, parameters)
     refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], [source, *subject.files.values()])
     measured = Measurement.from_deformation(total, subject, name=_TRUTH.name)
-    make_output(target)
-    with alone(target):
+    with output_folder(target), alone(target):
         made = synthetic_warp(subject.reference, subject.body(), total, Acquisition(seed), near=measured.bone_motion)
         write_image(target / _IMAGE, made.image)
         (target / _TRUTH).parent.mkdir(exist_ok=True)

@@ -19,6 +19,7 @@ from dvc.images.image import Grid, LabelMap, Mask
 from dvc.io import StrPath
 from dvc.io.images.read import read_voxels
 from dvc.io.images.text_headers import nrrd_fields
+from dvc.mesh import box_told
 from dvc.tables import read_table, read_text, refuse_half_a_line
 
 _log = logging.getLogger("dvc.images")
@@ -171,26 +172,27 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     if total == 0:
         raise GeometryError(f"{what}: all voxels are 0. Choose another file.")
     share = inside / total
-    boxes = f"Its grid: {own}. The image's grid: {grid}."
+    boxes = f"It spans {box_told(*own.bounds_mm())} mm; the image {box_told(*grid.bounds_mm())} mm (LPS)."
     if share < _NEEDED_OVERLAP:
         raise GeometryError(
             f"{what}: only {share:.0%} of its volume is inside the image; at least {_NEEDED_OVERLAP:.0%} is "
-            f"needed. {boxes} It was drawn on another image, or its header has a wrong position."
+            f"needed. {boxes} It was drawn on another image, or its header is wrong."
         )
     mirrored = _mirrored_axes(own, grid)
     if mirrored:
         raise GeometryError(
             f"{what}: its grid is that of the image with the signs of {mirrored} reversed, so RAS and LPS were "
-            f"confused. {boxes} Export it again from the image on which it was drawn."
+            f"confused. {boxes} Export it again from its image."
         )
     fitted: Any = _nearest(own, values, grid)
     left = np.count_nonzero(fitted) * grid.voxel_volume_mm3
     if left == 0:
         resampled = "no voxel is left after resampling to the grid of the image"
-        raise GeometryError(f"{what}: {resampled}. {boxes} Export it again from the image on which it was drawn.")
+        raise GeometryError(f"{what}: {resampled}. {boxes} Export it again from its image.")
     before = total * own.voxel_volume_mm3
     change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL; {100 * share:.0f} % of it is inside the image"
-    _log.warning("%s: on another grid than the image; resampled by nearest neighbour (%s). %s", what, change, boxes)
+    grids = f"Its grid: {own}. The image's grid: {grid}."
+    _log.warning("%s: on another grid than the image; resampled by nearest neighbour (%s). %s", what, change, grids)
     if isinstance(mask_or_labels, LabelMap):
         lost = sorted(set(_counts(values)) - set(_counts(fitted)))
         if lost:

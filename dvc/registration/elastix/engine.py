@@ -19,14 +19,13 @@ from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.io.transforms.read import bspline_from_elastix
 from dvc.io.transforms.write import write_elastix_transform
 from dvc.registration.elastix import run as elastix
-from dvc.registration.elastix.presets import Preset, load_preset
+from dvc.registration.elastix.presets import SPACING, Preset, load_preset
 from dvc.registration.engine import AlignedPair, Cost, Engine, Found, Progress
 from dvc.worker import Worker
 
 _log = logging.getLogger("dvc.registration.elastix.engine")
 
 _LEAST_VOXELS = 2.0
-_SPACING = "FinalGridSpacingInPhysicalUnits"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +60,11 @@ class Elastix(Engine):
                     '"RecursiveBSplineTransform" or "BSplineTransform".'
                 )
         given = (preset.parameters for preset in self.presets)
-        spacings = {p.get(_SPACING, p.get("FinalGridSpacingInVoxels", ("default",))) for p in given}
+        spacings = {p.get(SPACING, p.get("FinalGridSpacingInVoxels", ("default",))) for p in given}
         if len(spacings) > 1:
             raise ParameterError(
                 f"The stages end with different control point spacings: {sorted(map(' '.join, spacings))}. Each stage "
-                f"starts from the coefficients of the previous one, so {_SPACING} must be equal in all stages."
+                f"starts from the coefficients of the previous one, so {SPACING} must be equal in all stages."
             )
 
     @property
@@ -166,9 +165,9 @@ def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str,
 
     Closer ones follow noise: on slices of 6 mm, control points every 4 mm gave a shear of 0.3 where there was none.
     """
-    if _SPACING not in parameters:
+    if SPACING not in parameters:
         return parameters
-    given = np.array([float(v) for v in parameters[_SPACING]])
+    given = np.array([float(v) for v in parameters[SPACING]])
     asked = np.broadcast_to(given, (3,)) if given.size in (1, 3) else np.full(3, given[0])
     spacing = np.maximum(asked, _LEAST_VOXELS * grid.spacing_mm)
     if np.all(spacing <= asked + 1e-9):
@@ -180,7 +179,7 @@ def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str,
         given[0],
         used,
     )
-    return parameters | {_SPACING: tuple(f"{s:.6g}" for s in spacing)}
+    return parameters | {SPACING: tuple(f"{s:.6g}" for s in spacing)}
 
 
 def _stage_methods(stage: Mapping[str, Any]) -> str:
@@ -196,7 +195,7 @@ def _stage_methods(stage: Mapping[str, Any]) -> str:
 
     return (
         f"parameters '{stage.get('name')}', metric {value('Metric')}, {value('Transform')} with control points every "
-        f"{value(_SPACING)} mm (or two voxels, if that is larger), {value('NumberOfResolutions')} resolutions, "
+        f"{value(SPACING)} mm (or two voxels, if that is larger), {value('NumberOfResolutions')} resolutions, "
         f"{value('Optimizer')} with {value('MaximumNumberOfIterations')} iterations of "
         f"{value('NumberOfSpatialSamples')} samples"
     )

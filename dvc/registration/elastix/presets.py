@@ -24,6 +24,8 @@ _LABEL = re.compile(rf"^({_KINDS})\d*")
 
 _COUNTS = {"NumberOfResolutions": (1, 20), "MaximumNumberOfIterations": (0, 1_000_000)}
 """Numbers by which elastix, and the time left, count: the least and the most."""
+SPACING = "FinalGridSpacingInPhysicalUnits"
+"""Distance of control points, mm, which mrstrain adapts to the voxels."""
 
 # What mrstrain itself decides, so that results are reproducible and can be read back.
 _ALWAYS: dict[str, tuple[str, ...]] = {
@@ -144,6 +146,10 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
         if most and not (values and all(re.fullmatch(r"\d{1,9}", v) and least <= int(v) <= most for v in values)):
             given = " ".join(values)[:40]
             raise ParameterError(f"{name}: {parameter} takes whole numbers from {least} to {most}; it has '{given}'.")
+    lengths = parameters.get(SPACING, ())
+    if not all(map(_is_length, lengths)):
+        given = " ".join(lengths)[:40]
+        raise ParameterError(f"{name}: {SPACING} takes lengths above 0 mm; it has '{given}'.")
     if not parameters.get("Transform"):
         raise ParameterError(f'{name}: (Transform "...") is missing; give a B-spline or Euler transform.')
     return Preset(name, text, parameters)
@@ -154,6 +160,13 @@ def _could_be_meant(value: str) -> bool:
     with suppress(ValueError):
         return math.isfinite(float(value))
     return True
+
+
+def _is_length(value: str) -> bool:
+    """Whether a value is a number above 0; all are finite."""
+    with suppress(ValueError):
+        return float(value) > 0.0
+    return False
 
 
 def _nearest(name: str, known: Sequence[str] | frozenset[str]) -> str:

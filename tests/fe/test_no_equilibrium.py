@@ -1,0 +1,80 @@
+"""What cannot reach equilibrium ends with its cause, after a limited number of steps.
+
+A step is one linear solution. Processor time is looked at too, so that "within a minute" is more than a number of
+steps; it was 4 s at most.
+"""
+
+import re
+import time
+
+import pytest
+
+from dvc.errors import InputError
+from fe import LoadStep, Material, NeoHooke, Plate, Simulation, Yeoh, simulate
+from fe.linear import Solver
+from tests.fe.test_simulate import ALONG, DOWN, FAT, SKIN, dome
+
+MOST_STEPS, MINUTE = 1000, 60.0
+FALLING = Yeoh.of(0.03, c20_mpa=-0.02)
+SOFT = NeoHooke.of(1e-5)  # 10 Pa
+TOLD = "no equilibrium was found beyond"
+
+
+class Counted:
+    """Simulations of the dome, with what they cost."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.steps, solve = 0, Solver.solve
+
+        def counted(solver: Solver, *given: object) -> object:
+            self.steps += 1
+            return solve(solver, *given)
+
+        monkeypatch.setattr(Solver, "solve", counted)
+
+    def of(self, laws: dict[str, Material], load: LoadStep) -> Simulation:
+        began = time.process_time()
+        done = simulate(dome(), laws, Plate(DOWN, ALONG), [load])
+        self.seconds = time.process_time() - began
+        return done
+
+
+@pytest.mark.parametrize(
+    ("skin", "fat", "load", "cause"),
+    [
+        (FALLING, FAT, LoadStep("a", 40.0), "softens until its stress falls"),
+        (Yeoh.of(0.01, c20_mpa=-0.1), FAT, LoadStep("a", 40.0, 10.0), "softens until its stress falls"),
+        (SKIN, SOFT, LoadStep("a", 2.0), r"shear modulus of 0.01 kPa, .* Are they in MPa, entered as kPa\?"),
+        (SKIN, FAT, LoadStep("a", 2.0, 300.0), "about to fold"),
+    ],
+    ids=["falling skin", "falling steeply", "fat of 10 Pa", "sheared too far"],
+)
+def test_it_ends_within_a_minute_with_its_cause(
+    skin: Material, fat: Material, load: LoadStep, cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = Counted(monkeypatch)
+    done = counted.of({"skin": skin, "fat": fat}, load)
+    assert not done.complete
+    assert done.states[0].reached < 0.5
+    notes = " ".join(done.notes)
+    assert f"a: {TOLD}" in notes
+    assert re.search(cause, notes)
+    assert counted.steps < MOST_STEPS
+    assert counted.seconds < MINUTE
+
+
+@pytest.mark.parametrize(
+    ("laws", "load", "cause"),
+    [
+        ({"skin": SKIN, "fat": FAT}, LoadStep("a", 1e9), "Forces are in N and moduli in MPa"),
+        ({"skin": SKIN, "fat": NeoHooke.of(1e-8)}, LoadStep("a", 2.0), "fat has a shear modulus of 0.01 Pa"),
+    ],
+    ids=["a load of 10^9 N", "fat of .01 Pa"],
+)
+def test_what_no_tissue_can_is_refused_before_the_first_step(
+    laws: dict[str, Material], load: LoadStep, cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = Counted(monkeypatch)
+    with pytest.raises(InputError, match=cause):
+        counted.of(laws, load)
+    assert not counted.steps
