@@ -1,5 +1,7 @@
 """Work in child processes that may crash without taking the caller with them, as native code (elastix) can."""
 
+import ctypes
+import gc
 import os
 import re
 import signal
@@ -8,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as FutureTimeout, wait
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -54,6 +56,13 @@ def is_lack_of_memory(failure: BaseException | None) -> bool:
             return True
         failure = failure.__cause__
     return False
+
+
+def hand_memory_back() -> None:
+    """Give freed memory, which glibc keeps for what comes next, back to the system: after a task that needed much."""
+    gc.collect()
+    with suppress(OSError, AttributeError, TypeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Child(LokyProcess):  # type: ignore[misc]

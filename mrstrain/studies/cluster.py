@@ -23,7 +23,7 @@ from filelock import FileLock
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.software import software_key
 from dvc.threads import on_one_core, usable_cores
-from dvc.worker import is_lack_of_memory
+from dvc.worker import hand_memory_back, is_lack_of_memory
 from mrstrain.records.outcome import lack_of_machine
 from mrstrain.records.progress import NOTE, OnProgress, duration
 from mrstrain.studies import stages
@@ -54,6 +54,8 @@ _SETTINGS = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
     # Semaphores of a worker that was ended are removed by loky's tracker, which need not tell of it.
     "distributed.nanny.pre-spawn-environ.PYTHONWARNINGS": "ignore:resource_tracker:UserWarning",
+    # Of its own memory and load it keeps an hour, in each process, and nobody looks at it.
+    "distributed.admin.system-monitor.log-length": 10,
     "logging.distributed": "error",
 }
 
@@ -388,4 +390,5 @@ def _run(topic: str, call: _Call) -> tuple[StageResult | WorkerError | str, floa
     except Exception as error:
         lack = lack_of_machine(error)
         outcome = WorkerError(lack) if is_lack_of_memory(error) else lack or _A_FAULT + traceback.format_exc()
+    hand_memory_back()
     return outcome, time.monotonic() - began
