@@ -17,7 +17,7 @@ from loky import process_executor
 
 import dvc  # whose functions load when they are asked for: the processes of these tests import this file
 from dvc.errors import RegistrationError, WorkerError
-from dvc.worker import Worker, each_in_workers, side_by_side
+from dvc.worker import Worker, each_in_workers, hand_memory_back, side_by_side
 from tests.processes import is_gone, wait_for
 
 LONG_S, AT_ONCE_S = 60.0, 50.0
@@ -86,6 +86,17 @@ def test_memory_of_a_freed_array_serves_the_next_even_below_a_worker_of_dask(mon
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_freed_memory_goes_back_to_the_system_between_tasks():
+    process, blocks = psutil.Process(), [np.ones(12_000) for _ in range(2_000)]  # 192 MB, none of them a mapping
+    last = blocks.pop()  # above the others, which therefore stay
+    blocks.clear()
+    kept = process.memory_info().rss
+    hand_memory_back()
+    assert kept - process.memory_info().rss > 150e6
+    assert last[0] == 1.0
+
+
 def test_memory_that_runs_out_is_named_and_the_next_task_runs():
     with Worker(threads=1) as worker:
         with pytest.raises(WorkerError, match=r"memory ran out while registering Load1 \(.*16.*\)\. Free memory"):
