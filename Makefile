@@ -46,13 +46,15 @@ help:
 
 setup: $(VENV)/installed.stamp
 
+# What is installed is compiled on all cores: pip would do so on one, and half a minute long.
 $(VENV)/dependencies.stamp: requirements.lock
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with the venv module was found on PATH." \
 		"Install one (on Debian and Ubuntu also python3-venv), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "mrstrain needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
 	"$(PYTHON)" -m venv --clear $(VENV)
-	$(BIN)/python -m pip install $(QUIETLY) --require-hashes --only-binary :all: -r requirements.lock
+	$(BIN)/python -m pip install $(QUIETLY) --no-compile --require-hashes --only-binary :all: -r requirements.lock
+	@$(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV) || true  # some have files that no Python can compile
 	@touch $@
 
 # Built with the hatchling that the lock has pinned, so nothing comes in without a hash.

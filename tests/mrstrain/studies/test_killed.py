@@ -1,4 +1,8 @@
-"""Commands that are killed: what they leave is not taken for a result, and the same command gives the same results."""
+"""Commands that are killed: what they leave is not taken for a result, and the same command gives the same results.
+
+All of full size: in `make test`, a stage of a study and a simulation are killed (test_run, fe/test_restart), and what
+has begun and not ended is taken for no result (records/test_begun).
+"""
 
 from __future__ import annotations
 
@@ -115,7 +119,7 @@ def running_a_cohort(made: Path) -> Killed:
 @pytest.mark.parametrize(
     "case",
     [
-        driving, slow(levelling), slow(measuring_accuracy), slow(running_a_cohort),
+        slow(driving), slow(levelling), slow(measuring_accuracy), slow(running_a_cohort),
     ],
 )  # fmt: skip
 def test_a_command_that_is_killed_leaves_nothing_whole_and_gives_the_same_when_repeated(made, tmp_path, case):
