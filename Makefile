@@ -36,6 +36,8 @@ endif
 # Both cores to the end: a worker that has nothing left takes tests from the other, and each computes on one thread.
 THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=2
 PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
+# Else both workers, and the processes that they start, compile the same loops at the same time, 15 s long in each.
+COMPILED := $(THREADS) $(BIN)/python -c 'from dvc import GaussNewtonWithInterfaces; GaussNewtonWithInterfaces().prepare()'
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock audit clean-install docs peers clean
@@ -71,9 +73,11 @@ test: lint short-tests
 test-all: lint all-tests
 
 short-tests: setup
+	@$(COMPILED)
 	$(PYTEST) -m "not full_size"
 
 all-tests: setup
+	@$(COMPILED)
 	$(PYTEST)
 
 fuzz: setup

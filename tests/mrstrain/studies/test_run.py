@@ -51,11 +51,11 @@ def areas(study: Path) -> list[float]:
         return [float(row["ml"]) for row in csv.DictReader(file)]
 
 
-def test_no_result_names_the_patient_of_an_images_header(done):
+def test_no_result_names_the_patient_of_an_images_header(done, images):
     folder, *printed = done
     assert planted_in(folder / "results") == []
     assert not any(word in text for word in PLANTED for text in printed)
-    assert {one.rpartition(": ")[2] for one in planted_in(folder)} == set(PLANTED)
+    assert {one.rpartition(": ")[2] for one in planted_in(images)} == set(PLANTED)
 
 
 def test_every_result_is_there_and_the_report_tells_it(done):
