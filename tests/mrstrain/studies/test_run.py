@@ -27,7 +27,7 @@ from mrstrain.studies.init import init
 from mrstrain.studies.plan import plan
 from mrstrain.studies.run import forecast, report, run, run_studies
 from tests.planted import PLANTED, planted_in
-from tests.processes import cluster_of, under_way, wait_for
+from tests.processes import cluster_of, stages_run_here, under_way, wait_for
 from tests.quick import QUICK
 
 STAGES = ["register repeat", "register Load1", "register Load2", "mesh", "simulate akrami", "compare"]
@@ -222,7 +222,8 @@ def test_killed_in_any_stage_and_run_again_gives_the_same(done, tmp_path, stage)
         of_all.extend([fraction] if case == "all" else [])
         ended.extend([case] if case != "all" and fraction == 1.0 else [])
 
-    again = run(study, progress=progress, workers=1)
+    with stages_run_here():
+        again = run(study, progress=progress, workers=1)
     assert again.complete
     assert [name for name in STAGES if not again.outcomes[name].reused] == left
     assert {name: (records / f"{name}.json").read_bytes() for name in kept} == kept
