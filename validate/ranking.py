@@ -219,7 +219,7 @@ def _simultaneous(table: FloatArray) -> float:
     rest = table - table.mean(axis=0) - table.mean(axis=1)[:, None] + table.mean()
     freedom = (models - 1) * (subjects - 1)
     spread = np.sqrt((rest**2).sum() / freedom / subjects)
-    return _of_studentized_range(models, freedom) * spread
+    return float(_of_studentized_range(models, freedom) * spread)
 
 
 @cache
