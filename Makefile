@@ -36,6 +36,8 @@ endif
 # Both cores to the end: a worker that has nothing left takes tests from the other, and each computes on one thread.
 THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=2
 PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
+# Else both workers, and the processes that they start, compile the same loops at the same time, 15 s long in each.
+COMPILED := $(THREADS) $(BIN)/python -c 'from dvc import GaussNewtonWithInterfaces; GaussNewtonWithInterfaces().prepare()'
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock audit clean-install docs peers clean
@@ -46,13 +48,15 @@ help:
 
 setup: $(VENV)/installed.stamp
 
+# What is installed is compiled on all cores: pip would do so on one, and half a minute long.
 $(VENV)/dependencies.stamp: requirements.lock
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with the venv module was found on PATH." \
 		"Install one (on Debian and Ubuntu also python3-venv), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "mrstrain needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
 	"$(PYTHON)" -m venv --clear $(VENV)
-	$(BIN)/python -m pip install $(QUIETLY) --require-hashes --only-binary :all: -r requirements.lock
+	$(BIN)/python -m pip install $(QUIETLY) --no-compile --require-hashes --only-binary :all: -r requirements.lock
+	@$(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV) || true  # some have files that no Python can compile
 	@touch $@
 
 # Built with the hatchling that the lock has pinned, so nothing comes in without a hash.
@@ -69,9 +73,11 @@ test: lint short-tests
 test-all: lint all-tests
 
 short-tests: setup
+	@$(COMPILED)
 	$(PYTEST) -m "not full_size"
 
 all-tests: setup
+	@$(COMPILED)
 	$(PYTEST)
 
 fuzz: setup

@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import DEVNULL, Popen
@@ -70,6 +71,44 @@ def tasks_run_here() -> Iterator[None]:
         yield
 
 
+class _Client:
+    """A client of Dask that runs each stage when it is given; stages take it for their worker, too."""
+
+    status = "running"
+
+    def subscribe_topic(self, _topic: str, handler: Callable[[tuple[float, Any]], None]) -> None:
+        self._handler = handler
+
+    def log_event(self, _topic: str, event: object) -> None:
+        self._handler((0.0, event))
+
+    def submit(self, function: Callable[..., Any], *given: Any, **_: Any) -> Future[Any]:
+        future = Future[Any]()
+        future.status = "finished"  # type: ignore[attr-defined]
+        future.set_result(function(*given))
+        return future
+
+    def nthreads(self) -> dict[str, int]:
+        return {"here": 1}
+
+
+@contextmanager
+def stages_run_here() -> Iterator[None]:
+    """Stages of studies and their tasks run in this process: a cluster costs ten seconds of imports in each run."""
+    from mrstrain.studies import cluster
+
+    @contextmanager
+    def here(watch: Callable[[str, str, float], None], *_: object, **__: object) -> Iterator[cluster.StageRunner]:
+        with pytest.MonkeyPatch.context() as patch:
+            client = _Client()
+            patch.setattr(cluster, "get_worker", lambda: client)
+            yield cluster.StageRunner(client, watch)  # type: ignore[arg-type]
+
+    with tasks_run_here(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cluster, "cluster", here)
+        yield
+
+
 @contextmanager
 def tasks_run_in(one: Worker) -> Iterator[None]:
     """Tasks of all workers run in the process of one: the first use of elastix takes ten seconds in each."""
@@ -85,8 +124,8 @@ def tasks_run_in(one: Worker) -> Iterator[None]:
 
 
 @contextmanager
-def cluster_of_two(folder: Path, *options: str) -> Iterator[tuple[str, list[Popen]]]:
-    """A Dask scheduler on loopback, by its address, and two workers of one thread each, ended with the block.
+def cluster_of(count: int, folder: Path, *options: str) -> Iterator[tuple[str, list[Popen]]]:
+    """A Dask scheduler on loopback, by its address, and so many workers of one thread each, ended with the block.
 
     ``options`` are the scheduler's own.
     """
@@ -98,7 +137,7 @@ def cluster_of_two(folder: Path, *options: str) -> Iterator[tuple[str, list[Pope
         return Popen([*asked, "--scheduler-file", str(file)], env=environment, stdout=DEVNULL, stderr=DEVNULL)
 
     scheduler = started("dask_scheduler", "--host", "127.0.0.1", "--port", "0", *options)
-    places = [("--local-directory", str(folder / str(n))) for n in range(2)]
+    places = [("--local-directory", str(folder / str(n))) for n in range(count)]
     workers = [started("dask_worker", "--no-nanny", "--nthreads", "1", *place) for place in places]
     try:
         wait_for(file.is_file, scheduler)

@@ -13,6 +13,7 @@ import dvc
 import fe
 import validate
 from tests.fe.test_simulate import dome
+from tests.textures import everything, pair_of
 from tests.validate.test_comparison import case, cube, error_table, labels, sheared
 
 COPIES = [lambda one: pickle.loads(pickle.dumps(one)), copy.deepcopy]
@@ -46,9 +47,10 @@ def test_a_comparison_and_its_loads(copied: Callable[[Any], Any]) -> None:
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_measurement_with_its_images(tiny_pair: Any, worker: Any) -> None:
-    settings = dvc.Settings(dvc.GaussNewton(bending=4.0, volume=300.0))
-    made = dvc.measure(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.bone, settings=settings, worker=worker)
+def test_a_measurement_with_its_images() -> None:
+    settings = dvc.Settings(dvc.GaussNewton(5.0, bending=3.0, volume=300.0), align_on="none")
+    images = pair_of(dvc.Affine(np.eye(3), np.array([1.3, -0.6, 0.7])), 0.05)
+    made = dvc.measure(*images, tissue=everything(), settings=settings)
     assert made.source is not None
     for again in (copied(made) for copied in COPIES):
         np.testing.assert_array_equal(again.max_shear, made.max_shear)

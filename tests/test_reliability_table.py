@@ -106,7 +106,7 @@ ROWS = {
     ),
     15: Row(
         "kill -9 at every stage", "no half-written output; the same result",
-        (f"{RUN}test_killed_and_run_again_gives_the_same", f"{RUN}test_killed_in_any_stage_and_run_again",
+        (f"{RUN}test_killed_in_any_stage_and_run_again_gives_the_same",
          "fe/test_restart.py::test_a_killed_command_goes_on_where_it_was"),
     ),
     16: Row(

@@ -24,6 +24,7 @@ from dvc.report.page import Picture
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
 from dvc.trust.twin_judgement import Judged
 from tests.processes import tasks_run_here
+from tests.textures import everything, pair_of
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -199,25 +200,19 @@ def test_labels_of_another_grid_are_refused_before_anything_is_registered(tiny_p
         dvc.measure(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.bone, labels=labels, settings=settings)
 
 
-def test_landmarks_are_taken_as_they_are_read(tiny_pair, worker):
-    grid, point = tiny_pair.reference.grid, tiny_pair.bone.points().mean(axis=0, keepdims=True)
-    given = {
-        "tissue": dvc.Mask(grid, tiny_pair.labels.labels > 0),
-        "landmarks": (point, point, ("heel",)),
-        "worker": worker,
-    }
-    settings = replace(Settings.of("gauss-newton").of_repeat(), align_on="none")
-    one = dvc.measure(tiny_pair.reference, tiny_pair.repeat, settings=settings, **given)
+def test_landmarks_are_taken_as_they_are_read():
+    body = everything()
+    images, point = pair_of(dvc.Affine(np.eye(3), np.array([1.3, -0.6, 0.7])), 0.05), body.grid.centre_mm[None]
+    settings = Settings(dvc.GaussNewton(5.0, bending=3.0, volume=300.0), align_on="none")
+    one = dvc.measure(*images, tissue=body, landmarks=(point, point, ("heel",)), settings=settings)
     assert one.quality.landmark_errors_mm is not None
     assert one.quality.landmark_errors_mm.size == 1
 
 
-def test_a_repeat_scan_has_what_applies_to_it_alone(tiny_pair, measured, worker):
+def test_a_repeat_scan_has_what_applies_to_it_alone(tiny_pair, measured):
     """Its weights are fixed and its strain is the error itself: no table of weights, no error bars, no reason why."""
     subject = dvc.Subject(tiny_pair.reference, tiny_pair.bone)
-    how = Settings.of("gauss-newton").of_repeat()
-    found = dvc.register(tiny_pair.reference, tiny_pair.repeat, bone=tiny_pair.bone, settings=how, worker=worker)
-    evidence = dvc.Evidence(error_model=measured.error_bars.model)
+    found, evidence = measured.source.registration, dvc.Evidence(error_model=measured.error_bars.model)
     loaded, repeat = (
         dvc.Measurement.from_registration(found, subject, evidence, name=name, is_repeat=name == "repeat")
         for name in ("Load1", "repeat")

@@ -35,7 +35,11 @@ def test_a_mirrored_mask_is_told_with_its_axes(pair, axes, told, request):
     assert f"mirrored along the {told} voxel axis" in doubt
 
 
-@pytest.fixture(scope="module", params=[0.8, 1.2, (0.8, 0.8, 2.4)], ids=["0.8", "1.2", "0.8x0.8x2.4"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(0.8, marks=pytest.mark.full_size), 1.2, (0.8, 0.8, 2.4)],
+    ids=["0.8", "1.2", "0.8x0.8x2.4"],
+)
 def heel_at(request) -> tuple[Image, Mask]:
     """One heel at several voxels, mm, and its bone."""
     heel, grid = Heel(3), heel_grid(request.param)

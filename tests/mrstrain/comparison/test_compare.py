@@ -48,7 +48,6 @@ def with_errors(study: Path, bias: float, sd: float) -> None:
         )
 
 
-@pytest.mark.usefixtures("real_pictures")
 def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     with_errors(study, 0.0, 0.02)
     done = compare(study / "measured", [study / "half", study / "right"], on_image=True, **given(study))

@@ -94,7 +94,10 @@ def test_data_version_control_is_refused_when_a_package_is_imported(tmp_path: Pa
     assert "Data Version Control" in said
     assert "3.55.2 is installed in" in said
     assert said.endswith("environment of its own: python -m venv mrstrain-env, and install it there.")
-    assert told_by([ROOT], code) == ""
+
+
+def test_nothing_is_refused_when_only_ours_is_imported() -> None:
+    assert told_by([ROOT], "\n".join([*USES, *COMMANDS])) == ""
 
 
 @pytest.mark.parametrize("code", COMMANDS)

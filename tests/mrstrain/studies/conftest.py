@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from dvc.images.image import Grid, LabelMap
 from dvc.io.images.write import write_image, write_labels
 from tests.planted import plant_in_nifti
+from tests.processes import stages_run_here
 
 STUDY = """
 [study]
@@ -92,6 +94,13 @@ def done(images, made_once, tmp_path_factory):
     own = tmp_path_factory.mktemp("done") / "study"
     shutil.copytree(folder / "study", own)
     return own, *json.loads((folder / "told.json").read_text())
+
+
+@pytest.fixture
+def stages_in_this_process() -> Iterator[None]:
+    """For tests of what a study makes; others start the processes that users have."""
+    with stages_run_here():
+        yield
 
 
 @pytest.fixture

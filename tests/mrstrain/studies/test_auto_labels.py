@@ -13,6 +13,7 @@ import mrstrain
 from dvc import Mask, read_labels, write_image, write_mask
 from dvc.errors import InputError
 from mrstrain.studies.run import forecast, run
+from tests.processes import stages_run_here
 
 STUDY = """
 [study]
@@ -38,7 +39,8 @@ def study(tiny_pair, tmp_path_factory) -> Path:
     write_image(folder / "Load1.nii.gz", tiny_pair.loaded)
     write_mask(folder / "calcaneus.nii.gz", tiny_pair.bone)
     (folder / "study.toml").write_text(STUDY)
-    run(folder, workers=1)
+    with stages_run_here():
+        run(folder, workers=1)
     return folder
 
 
@@ -74,7 +76,7 @@ def test_only_what_another_mask_changes_is_done_anew(study, tiny_pair):
         write_mask(study / "calcaneus.nii.gz", tiny_pair.bone)
 
 
-def test_a_series_makes_its_label_map_as_a_study_does(study, tmp_path):
+def test_a_series_makes_its_label_map_as_a_study_does(study, tmp_path, in_this_process):
     """With `register`, and what it refuses before anything is made."""
     load0, load1, bone = study / "Load0.nii.gz", study / "Load1.nii.gz", study / "calcaneus.nii.gz"
     quick = {"bending": 3.0, "volume": 300.0, "borders": False}

@@ -17,9 +17,9 @@ import pytest
 from distributed.protocol import ToPickle, dumps
 
 from dvc.errors import InputError
-from mrstrain.studies.cluster import _refuse_unencrypted, cluster
+from mrstrain.studies.cluster import StageRunner, _refuse_unencrypted, cluster
 from mrstrain.studies.run import run
-from tests.processes import cluster_of_two
+from tests.processes import cluster_of
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
 
@@ -69,7 +69,7 @@ def test_a_cluster_with_the_certificate_of_the_manual(tmp_path: Path, monkeypatc
     for name, value in settings.items():
         monkeypatch.setenv(name, value)
     keys = {name.removeprefix("DASK_").lower().replace("__", "."): value for name, value in settings.items()}
-    with cluster_of_two(tmp_path, "--protocol", "tls") as (address, _):
+    with cluster_of(1, tmp_path, "--protocol", "tls") as (address, _):
         assert address.startswith("tls://127.0.0.1:")
         with (
             dask.config.set(keys),
@@ -102,7 +102,14 @@ def test_settings_for_a_cluster_with_tls_leave_this_machines_own_alone(monkeypat
     assert asked == [False]
 
 
-def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path):
+@pytest.fixture(scope="module")
+def of_this_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StageRunner]:
+    """Two workers, as a study has them on this machine."""
+    with cluster(lambda *_: None, [tmp_path_factory.mktemp("runs")], workers=2) as runner:
+        yield runner
+
+
+def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(of_this_machine, tmp_path):
     mark = str(tmp_path / "tried")
 
     def lost_once() -> str:
@@ -111,10 +118,9 @@ def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path)
             os._exit(1)
         return "done"
 
-    with cluster(lambda *_: None, [tmp_path], workers=2) as runner:
-        assert runner._client.submit(lost_once).result(timeout=300) == "done"
-        kept = runner._client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_", "freed arrays serve the next")
-        assert kept.result(timeout=300) == "freed arrays serve the next"
+    assert of_this_machine._client.submit(lost_once).result(timeout=300) == "done"
+    kept = of_this_machine._client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_", "freed arrays serve the next")
+    assert kept.result(timeout=300) == "freed arrays serve the next"
 
 
 def test_memory_that_a_worker_lacks_for_a_message_is_no_traceback(tmp_path, capfd):
@@ -136,15 +142,14 @@ def test_memory_that_a_worker_lacks_for_a_message_is_no_traceback(tmp_path, capf
     assert "Traceback" not in told, told
 
 
-def test_what_runs_a_study_is_reached_from_this_machine_alone(tmp_path):
-    with cluster(lambda *_: None, [tmp_path], workers=1):
-        family = psutil.Process(), *psutil.Process().children(recursive=True)
-        sockets = []
-        for process in family:
-            with suppress(psutil.NoSuchProcess):  # one of another test, which has just ended
-                sockets += process.net_connections("tcp")
+def test_what_runs_a_study_is_reached_from_this_machine_alone(of_this_machine):
+    assert of_this_machine._client.nthreads()
+    sockets = []
+    for process in (psutil.Process(), *psutil.Process().children(recursive=True)):
+        with suppress(psutil.NoSuchProcess):  # one of another test, which has just ended
+            sockets += process.net_connections("tcp")
     listening = [one.laddr.ip for one in sockets if one.status == psutil.CONN_LISTEN]
-    assert len(listening) >= 5  # the scheduler, its page, a nanny, a worker, and the worker's page
+    assert len(listening) >= 5  # the scheduler, its page, and at least a nanny, a worker, and the worker's page
     assert set(listening) == {"127.0.0.1"}
 
 

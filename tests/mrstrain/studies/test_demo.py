@@ -26,6 +26,7 @@ from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import read_errors, write_errors
 from mrstrain.truth.phantom import phantom
 from phantoms import Heel, TissueError, under_load
+from tests.processes import stages_run_here
 
 demonstration = import_module("mrstrain.studies.demo")  # the package has a function of that name
 
@@ -133,9 +134,10 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     assert "[registration]" not in study.read_text()
     study.write_text(study.read_text() + quick)
     pages, told = [], []
-    shown = demonstration.demo(
-        tmp_path / "demo", seed=3, progress=lambda *event: told.append(event), on_report=pages.append
-    )
+    with stages_run_here():
+        shown = demonstration.demo(
+            tmp_path / "demo", seed=3, progress=lambda *event: told.append(event), on_report=pages.append
+        )
     assert pages == [tmp_path / "demo" / "results" / "report.html"]
     found = [what for case, what, fraction in told if case == "register Load2" and fraction == 1.0]
     assert re.fullmatch(r"max\. shear strain in \w+ [\d.]+ median, [\d.]+ at the 95th percentile; .*", *found)
