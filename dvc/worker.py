@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import logging
 import os
 import re
 import signal
@@ -17,7 +18,8 @@ from typing import Any, TypeVar
 from loky import ProcessPoolExecutor
 from loky.backend.context import LokyContext
 from loky.backend.process import LokyProcess
-from loky.process_executor import ShutdownExecutorError, TerminatedWorkerError
+from loky.backend.utils import kill_process_tree
+from loky.process_executor import BrokenProcessPool, ShutdownExecutorError, TerminatedWorkerError
 
 from dvc.errors import WorkerError
 
@@ -65,6 +67,14 @@ def hand_memory_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+def _is_for_the_log(record: logging.LogRecord) -> bool:
+    """False for the traceback that loky logs where its own thread lacks memory; the task tells the cause."""
+    return not (record.exc_info and is_lack_of_memory(record.exc_info[1]))
+
+
+logging.getLogger("concurrent.futures").addFilter(_is_for_the_log)  # loky's
+
+
 class _Child(LokyProcess):  # type: ignore[misc]
     """A child that ends without a traceback where memory runs out beside its task; the caller sees that it died."""
 
@@ -104,7 +114,7 @@ class Worker(AbstractContextManager["Worker", None]):
         """Start the child process, and let it import modules and what their loops need, beside the caller."""
         with self._lock:
             for module in modules:
-                self._running().submit(_imported, module)
+                self._submitted(self._running(), _imported, module)
 
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
         """Run ``task(*args)`` in the child; its exceptions are raised here, and `WorkerError` if the child dies.
@@ -115,17 +125,20 @@ class Worker(AbstractContextManager["Worker", None]):
         """
         with self._lock:
             executor = self._running()
-            future = None
+            future: Future[_T] | None = None
 
             def watched() -> None:
                 if self._killed:  # while the process was being started
                     executor.shutdown(wait=False, kill_workers=True)
+                elif not _is_answered(executor) and future is not None and not future.done():
+                    self._abandon(executor)
+                    raise WorkerError(f"The memory ran out while {what}, beside its process. {TOO_LITTLE_MEMORY}")
                 elif watch is not None:
                     watch()
 
             try:
-                future = executor.submit(task, *args)
-                return _result(future, watched)  # type: ignore[no-any-return]
+                future = self._submitted(executor, task, *args)
+                return _result(future, watched)
             except (TerminatedWorkerError, ShutdownExecutorError) as died:
                 executor.shutdown(wait=False, kill_workers=True)
                 self._executor = None
@@ -139,11 +152,33 @@ class Worker(AbstractContextManager["Worker", None]):
             except Exception as failure:
                 if not is_lack_of_memory(failure):
                     raise
+                if isinstance(failure, BrokenProcessPool):  # there was none for a thread beside the process
+                    executor.shutdown(wait=False, kill_workers=True)
+                    self._executor = None
                 raise WorkerError(f"The memory ran out while {what} ({failure}). {TOO_LITTLE_MEMORY}") from failure
             finally:
                 if future is not None and not future.done():  # an interrupt: the task would be waited for
                     executor.shutdown(wait=False, kill_workers=True)
                     self._executor = None
+
+    def _submitted(self, executor: ProcessPoolExecutor, task: Callable[..., _T], *args: Any) -> "Future[_T]":
+        """The task, sent to the child process; where it cannot be sent, the process is ended.
+
+        Without memory for the thread that loky starts beside the process, nothing would take up its results, and the
+        next task would be waited for without end.
+        """
+        try:
+            return executor.submit(task, *args)  # type: ignore[no-any-return]
+        except BaseException:
+            self._abandon(executor)
+            raise
+
+    def _abandon(self, executor: ProcessPoolExecutor) -> None:
+        """End the child process where loky's thread beside it does not run, which would end it."""
+        for process in list(executor._processes.values()):
+            kill_process_tree(process)
+        executor.shutdown(wait=False)
+        self._executor = None
 
     def _running(self) -> ProcessPoolExecutor:
         """The child process, started where there is none."""
@@ -247,6 +282,12 @@ def _result(future: "Future[_T]", watch: Callable[[], None] = lambda: None) -> _
             if future.done():
                 raise  # the task itself timed out on something; not ours to hide
             watch()
+
+
+def _is_answered(executor: ProcessPoolExecutor) -> bool:
+    """Whether loky's thread runs that takes the answers of the child process."""
+    thread = executor._executor_manager_thread
+    return thread is None or thread.is_alive()
 
 
 def _imported(module: str) -> None:

@@ -1,6 +1,7 @@
 """How the loads of a subject are measured, in a series or by a worker of a study, and checked by their twins."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -67,9 +68,13 @@ class Plan:
 
 
 def _load_what_draws() -> None:
-    """Import all that a measurement takes, and what writes its figures as PDF, which matplotlib imports only then."""
-    _ = dvc.Measurement
-    import_module("matplotlib.backends.backend_pdf")
+    """Import all that a measurement takes, and what writes its figures as PDF, which matplotlib imports only then.
+
+    What there is no memory for is told where it is needed, and not by this thread.
+    """
+    with suppress(ImportError, MemoryError):
+        _ = dvc.Measurement
+        import_module("matplotlib.backends.backend_pdf")
 
 
 def record_of(

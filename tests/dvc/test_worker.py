@@ -138,6 +138,38 @@ def test_a_process_that_lacks_memory_after_its_task_ends_without_a_traceback(cap
     assert "Traceback" not in told, told
 
 
+@pytest.mark.parametrize(
+    ("of", "thread"),
+    [(process_executor._ExecutorManagerThread, "start"), (process_executor._SafeQueue, "_start_thread")],
+    ids=["results", "tasks"],
+)
+def test_where_memory_lacks_for_a_thread_beside_the_process_the_next_task_runs(of, thread, capfd, monkeypatch):
+    """loky starts threads that take results and send tasks: without the first the next task was never answered."""
+
+    def lacking(_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with Worker(threads=1) as worker:
+        with monkeypatch.context() as without:
+            without.setattr(of, thread, lacking)
+            with pytest.raises(WorkerError, match="memory ran out while meshing"):
+                worker.run("meshing", sum, [1, 2])
+        assert worker.run("adding", sum, [1, 2]) == 3
+        time.sleep(2.0)  # a process that was left would have started by now
+    told = "".join(capfd.readouterr())
+    assert "Traceback" not in told, told
+
+
+def test_a_task_whose_answer_no_thread_takes_is_ended(monkeypatch):
+    """As where there is no memory to tell that there is none."""
+    with Worker(threads=1) as worker:
+        with monkeypatch.context() as without:
+            without.setattr(process_executor._ExecutorManagerThread, "run", lambda _: None)
+            with pytest.raises(WorkerError, match="memory ran out while meshing, beside its process"):
+                worker.run("meshing", sum, [1, 2])
+        assert worker.run("adding", sum, [1, 2]) == 3
+
+
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])
 def test_death_is_an_error_that_says_so_and_the_next_task_runs(task, signal_name):
     with Worker(threads=1) as worker:

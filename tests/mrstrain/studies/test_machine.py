@@ -116,7 +116,10 @@ def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, died):
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
 @pytest.mark.parametrize(("mib", "ends"), [(800, 2), (1120, 1)])
 def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, ends):
-    """Address space for the command itself is lacking, then for the libraries of its stages."""
+    """Address space for the command itself is lacking, then for the libraries of its stages.
+
+    Dask and loky may print tracebacks of their own where they get no thread; none comes from mrstrain.
+    """
     shutil.copytree(images, tmp_path / "study")
     told = subprocess.run(
         [sys.executable, "-m", "mrstrain", "run", str(tmp_path / "study"), "--workers", "2"],
@@ -128,7 +131,7 @@ def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, 
     assert "The memory ran out" in said
     assert "fewer --workers" in said.replace("\n", " ")
     assert "error in mrstrain" not in said
-    assert "Traceback" not in said
+    assert not re.search(r'File "\S*/(?:dvc|fe|mrstrain|phantoms|validate)/', said), said
     if ends == 1:
         log = (tmp_path / "study" / "results" / "study.log").read_text()
         assert re.search(
