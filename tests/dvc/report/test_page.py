@@ -16,7 +16,6 @@ import pytest
 from PIL import Image as Pixels
 from scipy.ndimage import gaussian_filter
 
-from dvc.arrays import FloatArray
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, LabelMap
 from dvc.report.alike import alike
@@ -201,12 +200,13 @@ def test_a_picture_on_the_page_is_smaller_than_its_file_and_looks_the_same() -> 
         assert np.sqrt(np.mean((one - other) ** 2)) <= near
 
 
-def unpacked(volume: Volume) -> FloatArray:
-    """The values of a volume, as the viewer adds them up."""
-    held = nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(volume.data)))
+def unpacked(data: str) -> nibabel.Nifti1Image:
+    """A volume as a page holds it, its differences added up as the viewer does."""
+    held = nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(data)))
     flat = held.dataobj.get_unscaled().astype(np.uint8).ravel(order="F")
     rows = np.append(flat, np.zeros(-flat.size % held.shape[0], np.uint8)).reshape(-1, held.shape[0])
-    return np.cumsum(rows, axis=0, dtype=np.uint8).ravel().reshape(held.shape, order="F") * held.dataobj.slope
+    steps = np.cumsum(rows, axis=0, dtype=np.uint8).ravel()[: flat.size].reshape(held.shape, order="F")
+    return nibabel.Nifti1Image(steps * held.dataobj.slope, held.affine)
 
 
 def chart_png() -> bytes:
@@ -240,9 +240,11 @@ def test_a_volume_is_held_once_for_all_its_viewers(tmp_path: Path) -> None:
     page = (tmp_path / "r.html").read_text()
     assert (page.count(image.data), page.count(strain.data)) == (1, 1)
     assert len(re.findall(r'class="overlay" data-volume="volume-2"', page)) == 2
-    np.testing.assert_allclose(unpacked(strain), values, atol=0.5 * 119.0 / 80 + 1e-6)
-    np.testing.assert_allclose(unpacked(image)[values > 12.4], values[values > 12.4], atol=0.5 * 119.0 / 24 + 1e-6)
-    assert not unpacked(image)[values < 12.3].any()  # the noise of the air
+    np.testing.assert_allclose(unpacked(strain.data).get_fdata(), values, atol=0.5 * 119.0 / 80 + 1e-6)
+    np.testing.assert_allclose(
+        unpacked(image.data).get_fdata()[values > 12.4], values[values > 12.4], atol=0.5 * 119.0 / 24 + 1e-6
+    )
+    assert not unpacked(image.data).get_fdata()[values < 12.3].any()  # the noise of the air
     library = gzip.decompress(base64.b64decode(re.search(r'id="niivue">([^<]+)<', page)[1]))
     assert b"Niivue" in library
     page_scripts = re.findall("<script>(.*?)</script>", page, re.S)
