@@ -2,7 +2,7 @@
 
     mrstrain demo --out DEMO
     python -m pytest tests/test_tutorials.py -o tmp_path_retention_policy=all --basetemp=TUTORIALS
-    python docs/pictures.py DEMO TUTORIALS
+    PYTHONPATH=. python docs/pictures.py DEMO TUTORIALS
 
 Pictures of the gallery are made by its examples (docs/gallery.md), those of the benchmarks by benchmarks/plots.py.
 """
@@ -13,6 +13,7 @@ import re
 import sys
 from datetime import datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,6 +22,9 @@ from PIL import Image
 import dvc
 import fe
 import phantoms
+from dvc.report.strokes import MARKED, write_strokes_page
+from tests.browser import browser
+from tests.dvc.report.test_strokes_in_a_browser import choose, draw, opened as opened_in
 
 IMAGES = Path(__file__).resolve().parent / "images"
 WIDTH, HEIGHT = 900, 640  # pixels, at most
@@ -42,6 +46,18 @@ TUTORIALS = {
     "python-validate": "test_validate_in_python0/compared/curves_by_load.png",
     "python-dvc": "test_dvc_in_python0/max_shear.png",
 }
+
+
+STROKES = [  # tissue, brush in mm, plane, and spots as shares of the slice's width and height
+    ("bone", 2.0, "sagittal", (0.60, 0.47), (0.66, 0.46), (0.72, 0.47)),
+    ("fat", 2.0, "sagittal", (0.55, 0.75), (0.62, 0.76), (0.68, 0.74)),
+    ("fat", 2.0, "sagittal", (0.82, 0.68), (0.84, 0.62), (0.85, 0.56)),
+    ("muscle", 2.0, "sagittal", (0.18, 0.66), (0.26, 0.67), (0.33, 0.68)),
+    ("bone", 2.0, "coronal", (0.45, 0.45), (0.50, 0.47), (0.55, 0.46)),
+    ("fat", 2.0, "coronal", (0.40, 0.75), (0.50, 0.765), (0.60, 0.75)),
+    ("bone", 2.0, "axial", (0.46, 0.62), (0.50, 0.64), (0.54, 0.62)),
+    ("skin", 1.0, "coronal", (0.47, 0.815), (0.50, 0.818), (0.53, 0.815)),
+]
 
 
 def save(name: str, picture: Image.Image, width: int = WIDTH) -> None:
@@ -134,6 +150,21 @@ def motions() -> plt.Figure:
     return figure
 
 
+def strokes(image: Path) -> Image.Image:
+    """The page to draw on, with strokes in four tissues of the demonstration's heel."""
+    numbers = {tissue: number for number, tissue in MARKED.items()}
+    with TemporaryDirectory() as folder, browser() as tab:
+        page = Path(folder) / "strokes.html"
+        write_strokes_page(page, image.name, dvc.read_image(image))
+        opened_in(tab, page)
+        for tissue, brush_mm, plane, *spots in STROKES:
+            choose(tab, numbers[tissue], brush_mm)
+            draw(tab, plane, *spots)
+        tab.value("window.scrollTo(0, 0)")
+        shown = tab.call("Page.captureScreenshot", format="png")["data"]
+    return Image.open(io.BytesIO(base64.b64decode(shown))).crop((0, 0, 1400, 860))
+
+
 def bed() -> plt.Figure:
     """Tissue on a flat bone on a plate behind it, pressed and pulled upward, as over a sacrum."""
     values = dvc.Grid((16, 9, 16), (2.5, 2.5, 2.5), (0.0, 0.0, 0.0))
@@ -158,6 +189,7 @@ def main() -> None:
     save("phantoms", drawn(phantom_scans()))
     save("other-sites", drawn(bed()))
     save("theory", drawn(motions()))
+    save("strokes", strokes(demo / "Load0.nii.gz"))
 
 
 if __name__ == "__main__":

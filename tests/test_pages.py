@@ -37,6 +37,12 @@ def test_the_readme_is_short() -> None:
     assert header.strip("|").count("|") + 1 <= 6
 
 
+@pytest.mark.parametrize(("page", "minutes"), [("limits.md", 4), ("verdicts.md", 5.5)])
+def test_what_to_read_first_is_read_in_minutes(page: str, minutes: float) -> None:
+    text = re.sub(r"!\[.*?\]\(.*?\)|\]\([^)]*\)", "", (DOCS / page).read_text())
+    assert len(re.findall(r"\S*\w\S*", text)) < 230 * minutes  # words a minute
+
+
 @pytest.mark.parametrize("page", READ, ids=lambda page: str(page.relative_to(DOCS)))
 def test_a_page_begins_with_a_picture(page: Path) -> None:
     head = "\n".join(page.read_text().splitlines()[:ABOVE_THE_FOLD])

@@ -20,11 +20,11 @@ def strip_of(one: LoadComparison, measured: Deformation, results: Sequence[FeRes
     across = np.abs(np.cross(one.case.axes[:, 0], one.case.axes[:, 1]))
     plane = PLANES[int(np.argmax(across))]
     view = View.through(labels.grid, point_mm, labels.labels > 0)
-    shown = np.zeros(labels.grid.shape)
+    bones = [number for number, name in labels.names.items() if name in one.bones]
+    shown = (labels.labels > 0) + 1.0 * np.isin(labels.labels, bones)
     if scanned is not None:
         seen, voxels = read_voxels(scanned)
         shown = np.nan_to_num(voxels) if seen.same_as(labels.grid) else shown
-    bones = [number for number, name in labels.names.items() if name in one.bones]
     soft = (labels.labels > 0) & ~np.isin(labels.labels, bones) & _in_slice(view, plane)
     fields: dict[str, Deformation] = {MEASURED: measured} | {r.name: r.deformation for r in results}
     pages: dict[str, Float32Array] = {}

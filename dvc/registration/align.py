@@ -123,8 +123,7 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     if score < _LOWEST_SIMILARITY:
         raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
     points = mask.points()
-    advice = f"so the position of the {on} is uncertain. Check that the mask covers it on the unloaded image and that "
-    advice += "all of it is in the loaded image."
+    advice = f"so the position of the {on} is uncertain. {_what_to_do(on)}"
     try:
         pairs = fit.halves(best)
     except RegistrationError as why:
@@ -214,9 +213,16 @@ def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highe
             f"{told} With inverted contrast it is {inverted:.2f}: {_OTHER_MEASURE} and --align none, if the images "
             "share a frame."
         )
+    return f"{told} {_what_to_do(on)}"
+
+
+def _what_to_do(on: AlignOn) -> str:
+    """The next step where the alignment on a bone, or on the whole image, was refused."""
+    if on == "image":
+        return "Give a mask of a bone (--bone) instead, or use --align none, if the images share a frame."
     return (
-        f"{told} Check that both images show the same body part, that the mask covers it, and that all of it is in "
-        "the loaded image; or use --align image or none."
+        "Check that both images show the same body part and all of the bone, and that the mask covers it; or use "
+        "--align image or none."
     )
 
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import nibabel
 import numpy as np
@@ -33,8 +33,9 @@ _TONES: Mapping[Level | None, tuple[str, str]] = {
 }  # fmt: skip
 """Colours of a notebook's headline and its ground, by the level of the verdict in it."""
 _GREYS, _COLOURS = 24, 80  # steps of a volume's values: each takes room, of noise above all; a strain to .007 of .55
+_BLACK = 2.5  # steps of an image: below, it is air
 _QUALITY = 58  # of pictures on the page; files of figures lose nothing
-_SMALL = 100_000  # bytes of a PNG: a chart, which is smaller yet without loss
+_WHITE, _CHART_COLOURS = 0.5, 64  # a chart: so much of it is white, and so many colours are enough
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"
 """Version of the viewer (WebGL 2, niivue.com) that comes with the package; it draws what the page itself holds."""
@@ -110,10 +111,24 @@ class Table:
         columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.columns)
         return tuple(bool(column) and not any(isinstance(c, str) for c in column) for column in columns)
 
+    @property
+    def texts(self) -> list[tuple[str, ...]]:
+        """The cells of all rows, those apart last, as people read them; numbers of a column have digits alike.
+
+        >>> Table("t", ("model", "area, mL"), (("a", 2.0), ("b", 3.83), ("c", 0.0), ("d", 120.4))).texts
+        [('a', '2.00'), ('b', '3.83'), ('c', '0'), ('d', '120')]
+        """
+        columns = zip(*self.rows, *self.apart, strict=True)
+        texts = [_alike(of) if number else map(shown, of) for of, number in zip(columns, self.numeric, strict=False)]
+        return list(zip(*texts, strict=True))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Volume:
-    """A volume as a page holds it: NIfTI, eight bits, compressed, base64; ``most`` is the value of the last colour."""
+    """A volume as a page holds it; ``most`` is the value of the last colour.
+
+    NIfTI of eight bits, each voxel less the one a row before it (``viewer.js`` adds them up), compressed, base64.
+    """
 
     title: str
     data: str
@@ -121,8 +136,11 @@ class Volume:
 
     @classmethod
     def image(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Self:
-        """An MR image (ni, nj, nk), from 0 to ``most``, the value that is drawn white; NaN becomes 0."""
-        return cls._of(title, grid, values, most, _GREYS)
+        """An MR image (ni, nj, nk), from 0 to ``most``, the value that is drawn white; NaN becomes 0.
+
+        What is below a tenth of white is black: it is noise in the air, which would take most of the room.
+        """
+        return cls._of(title, grid, np.where(values < most * _BLACK / _GREYS, 0.0, values), most, _GREYS)
 
     @classmethod
     def overlay(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Self:
@@ -132,8 +150,12 @@ class Volume:
     @classmethod
     def _of(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float, steps: int) -> Self:
         known, step = np.nan_to_num(np.asarray(values, dtype=np.float64)), most / steps
-        image = nibabel.Nifti1Image(np.clip(np.rint(known / step), 0, 255).astype(np.uint8), _TO_RAS @ grid.affine)
+        held = np.clip(np.rint(known / step), 0, 255).astype(np.uint8)
+        in_file, row = held.ravel(order="F"), held.shape[0]
+        in_file[row:] -= in_file[:-row].copy()
+        image = nibabel.Nifti1Image(in_file.reshape(held.shape, order="F"), _TO_RAS @ grid.affine)
         image.header.set_slope_inter(step, 0.0)
+        image.header["descrip"] = "each voxel less the one a row before it"  # results of older versions have none
         return cls(title, packed(image.to_bytes()), most)
 
 
@@ -173,6 +195,17 @@ def shown(value: Cell) -> str:
     return "–" if value is None or isinstance(value, float | np.floating) else str(value)
 
 
+def _alike(column: Sequence[Cell]) -> list[str]:
+    """Numbers of a column as `shown` writes them, with zeros at the end where others have more digits, up to three."""
+    texts = [shown(cell) for cell in column]
+    decimals = max((len(text.partition(".")[2]) for text in texts), default=0)
+    for place, (cell, text) in enumerate(zip(column, texts, strict=True)):
+        if isinstance(cell, float | np.floating) and np.isfinite(cell) and (value := float(text)):
+            whole = int(np.floor(np.log10(abs(value)))) + 1  # digits before the point; below 0.1, zeros after it
+            texts[place] = text if abs(value) < 1e-4 else f"{value:.{max(0, min(decimals, 3 - whole))}f}"
+    return texts
+
+
 def record_lines(record: Mapping[str, object]) -> dict[str, str]:
     """A provenance record as lines of a report."""
     lines: dict[str, str] = {}
@@ -194,10 +227,20 @@ def _line(value: object) -> str:
 
 @lru_cache(maxsize=256)
 def _small(png: bytes) -> str:
+    """The picture as WebP: as a photograph, or, where that is smaller, a chart in a few colours, which stays sharp."""
     with Pixels.open(io.BytesIO(png)) as picture:
-        file, pixels = io.BytesIO(), picture.convert("RGB")
-    pixels.save(file, "WEBP", quality=_QUALITY, method=2, lossless=len(png) < _SMALL)
-    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+        pixels = picture.convert("RGB")
+    files = [_webp(pixels, quality=_QUALITY)]
+    if pixels.convert("L").histogram()[-1] > _WHITE * pixels.width * pixels.height:
+        few = pixels.quantize(_CHART_COLOURS, dither=Pixels.Dither.NONE)
+        files.append(_webp(few.convert("RGB"), lossless=True))
+    return "data:image/webp;base64," + base64.b64encode(min(files, key=len)).decode()
+
+
+def _webp(pixels: Pixels.Image, **how: Any) -> bytes:
+    file = io.BytesIO()
+    pixels.save(file, "WEBP", method=4, **how)
+    return file.getvalue()
 
 
 @cache
@@ -236,7 +279,7 @@ def write_report(
         list(pool.map(_small, (png for one in pictures for png in (one.png, *(png for _, png in one.beneath)))))
     style, script, library = stored("page.css"), stored("page.js"), _library() if volumes else None
     scripts = [script, library["script"], library["code"]] if library else [script]
-    page = template("report", shown=shown, alike=alike).render(
+    page = template("report", alike=alike).render(
         **told, sections=sections, volumes=volumes, style=style, script=script, library=library,
         policy=policy(style, scripts, viewer=bool(volumes)), reload_s=reload_s, beneath={},
     )  # fmt: skip
@@ -248,4 +291,4 @@ def notebook_html(
 ) -> str:
     """What a notebook shows of a result: a headline with the verdict, if there is one, a picture, a table, notes."""
     told = {"headline": headline, "picture": picture, "table": table, "verdict": verdict, "notes": notes}
-    return template("notebook", shown=shown).render(**told, tones=_TONES)
+    return template("notebook").render(**told, tones=_TONES)

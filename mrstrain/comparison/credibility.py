@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc import Verdict
+from dvc.report.alike import alike
 from dvc.report.page import Section, Table
 from fe import Tolerance
 from mrstrain.comparison.methods import models_with
@@ -232,14 +233,13 @@ def _factors(held: Holdings) -> Table:
     )
     conditions = "; ".join(dict.fromkeys(f"{step.name} {step}" for one in models for step in one.steps))
     known = held.comparison is not None
-    compared = "Strain-volume curves, location above thresholds, and cell by cell; see In vivo validation"
+    compared = "Strain-volume curves, location above thresholds, and cell by cell; see evidence 4"
     rows = (
         ("Software quality assurance", "Tests with each version; versions and hashes of all inputs in the provenance",
          given.level_software_quality),
         ("Numerical code verification", "See evidence 1", given.level_code_verification),
-        ("Discretization error", _sentences(" ".join(held.convergence) or f"Convergence: {NOT_GIVEN}", meshes),
-         given.level_discretization_error),
-        ("Numerical solver error", _told(_solved(held)), given.level_solver_error),
+        ("Discretization error", _sentences(meshes, "See evidence 8"), given.level_discretization_error),
+        ("Numerical solver error", "See evidence 8", given.level_solver_error),
         ("Use error", "Inputs are checked before a run; a second person's check is not known here",
          given.level_use_error),
         ("Model form", _told(laws), given.level_model_form),
@@ -250,9 +250,9 @@ def _factors(held: Holdings) -> Table:
         ("Test conditions", f"{len(held.verdicts)} loads: {', '.join(held.verdicts)}", given.level_test_conditions),
         ("Equivalency of input parameters", _equivalent(held), given.level_input_equivalency),
         ("Output comparison", compared if known else NOT_GIVEN, given.level_output_comparison),
-        ("Relevance of the quantities of interest", _by_person(given.quantities_of_interest),
+        ("Relevance of the quantities of interest", "See Quantities of interest, above",
          given.level_relevance_of_quantities),
-        ("Relevance of the validation activities to the context of use", _by_person(given.applicability),
+        ("Relevance of the validation activities to the context of use", "See Applicability, above",
          given.level_relevance_of_validation),
     )  # fmt: skip
     columns = ("factor", "what this report holds", "level, judged by a person")
@@ -265,6 +265,6 @@ def _equivalent(held: Holdings) -> str:
         return NOT_GIVEN
     verdict = held.comparison.verdict
     reasons = () if verdict is None or verdict.level == "trust" else verdict.reasons
-    doubts = " ".join(reason for reason in reasons if ", registration (" not in reason)  # which is of the measurement
+    doubts = " ".join(alike(reason for reason in reasons if ", registration (" not in reason))  # of the models
     doubts = doubts or "no sign of another place, unit or frame"
     return f"Models and measurement in one frame, on the same cells. Inputs of the models: {doubts}"

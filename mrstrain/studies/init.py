@@ -243,7 +243,9 @@ def _role(stem: str) -> str | None:
     again = _AGAIN.search(stem) is not None
     if _UNLOADED.search(stem):
         return "repeat" if again else "load0"
-    return "load" if _LOADED.search(stem) and not again else None
+    if _LOADED.search(stem) and not again:
+        return "load"
+    return "bone_mask" if is_bones_name(stem) else None
 
 
 def _table(place: Path, image: str | None) -> str | None:

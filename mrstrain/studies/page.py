@@ -10,7 +10,7 @@ from dvc.errors import MrstrainError
 from dvc.io.result_folder import PROVENANCE
 from dvc.measurement.page import STRAIN
 from dvc.measurement.side_by_side import FIGURE, measured_by_load
-from dvc.report.page import METHODS, Picture, Section, Table, record_lines, write_report
+from dvc.report.page import METHODS, Cell, Picture, Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.comparison.credibility import TITLE as CREDIBILITY
 from mrstrain.comparison.methods import methods_of_registrations
@@ -158,13 +158,14 @@ def _incomplete(outcomes: Mapping[str, StageOutcome]) -> list[str]:
 
 
 def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:
-    rows = [
-        (name, one.status, record.seconds if (record := one.record) else None, "\n".join(lines).strip())
-        for name, one in outcomes.items()
-        for lines in [(one.reason, *one.result.lines)]
-    ]
-    table = Table(
-        "Stages", ("stage", "status", "time, s", "summary"), tuple(rows),
-        "Time of the run that made the result, on one core while other stages were running.",
-    )  # fmt: skip
-    return Section("Stages", None, (table,))
+    """Status, time and result of each stage; what a section of the report tells stands there, in one line here."""
+    first: dict[str, str] = {}  # the stage that tells a reason
+    rows: list[tuple[Cell, ...]] = []
+    for name, one in outcomes.items():
+        told = first.setdefault(one.reason, name)
+        reason = f"As {told}." if one.reason and told != name else one.reason
+        result = (one.result.headline,) if one.result.sections and one.result.headline else one.result.lines
+        seconds = None if one.record is None else one.record.seconds
+        rows.append((name, one.status, seconds, "\n".join((reason, *result)).strip()))
+    note = "Time of the run that made the result, on one core while other stages were running."
+    return Section("Stages", None, (Table("Stages", ("stage", "status", "time, s", "summary"), tuple(rows), note),))

@@ -164,12 +164,13 @@ def _measure_all(
     computing, reporting = threading.Lock(), threading.Lock()
     failures: dict[str, str] = {}
     fractions: dict[str, float] = {}
+    of_all = f"{len(cases)} registration{'s' * (len(cases) > 1)}"
 
     def report(name: str, fraction: float) -> None:
         with reporting:
             fractions[name] = fraction
             # relative to the cases of this call, so that the time left is that of this call
-            progress("accuracy", f"{len(cases)} registrations", sum(fractions.values()) / len(cases))
+            progress("accuracy", of_all, sum(fractions.values()) / len(cases))
 
     def measure_one(case: AccuracyCase, worker: Worker) -> None:
         try:

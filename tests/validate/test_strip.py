@@ -56,6 +56,7 @@ def test_each_page_has_its_own_fields_strain_in_soft_tissue_alone(given: LabelMa
     body, bone = shown.outlines
     assert body.all()
     np.testing.assert_array_equal(bone, ~soft)
+    assert shown.image[bone].min() > shown.image[soft].max()  # the label map, since there is no image
 
 
 def test_measured_stands_above_the_model_and_the_loads_side_by_side() -> None:

@@ -185,10 +185,13 @@ def test_row_9_a_bone_along_which_fits_slide_is_not_located(along, noise):
         clean = gaussian_filter(np.where(shape, 100.0, 40.0), 0.7)
         return Image(grid, (clean + noise * random.normal(size=shape.shape)).astype(np.float32))
 
-    with pytest.raises(RegistrationError, match="the position of the bone is uncertain"):
+    advice = r"the position of the bone is uncertain\. Check .* or use --align image or none\.$"
+    with pytest.raises(RegistrationError, match=advice):
         align(seen(rod), seen(rod), bone, "bone", 1)
     found = align(seen(rod | knob), seen(rod | knob), bone, "bone", 1)
     assert found.repeatability_mm < (0.4 if noise else 0.02)
+    with pytest.raises(RegistrationError, match=r"the image is uncertain\. Give a mask .* or use --align none, if"):
+        align(seen(rod), seen(rod), bone, "image", 1)
 
 
 @pytest.mark.parametrize("noise", [0.5, 3.0])

@@ -60,6 +60,9 @@ def test_a_page_works_under_its_policy(tab: Tab, tmp_path: Path) -> None:
     tab.wait_for("'state' in document.querySelector('.viewer').dataset")
     assert tab.value("document.querySelector('.viewer').dataset.state") == "shown"
     assert tab.said == []
+    values = np.random.default_rng(0).random((12, 14, 16))  # of `page_of`
+    held = tab.value("nifti('volume-2').then((bytes) => [...bytes.slice(352)])")
+    np.testing.assert_array_equal(held, np.rint(values * 80).ravel(order="F"))
 
 
 def test_a_name_stays_a_name(tab: Tab, tmp_path: Path) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import csv
-import gzip
 import html
 import json
 import re
@@ -13,7 +11,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import meshio
-import nibabel
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -24,6 +21,7 @@ from dvc.io.images.write import write_labels
 from mrstrain.cli.app import app
 from mrstrain.comparison.compare import compare
 from mrstrain.records.provenance import file_hash, provenance
+from tests.dvc.report.test_page import unpacked
 from tests.validate.test_comparison import cube, error_table, labels, sheared
 
 LOADS = {"Load1": 0.8, "Load2": 0.4}
@@ -142,9 +140,7 @@ def test_the_report_needs_nothing_else_and_says_what_it_rests_on(plain) -> None:
     volumes = dict(re.findall(r'id="(volume-\d+)">([^<]*)<', page))
     overlays = re.findall(r'class="overlay" data-volume="([^"]*)" data-title="([^"]*)"', page)
     held = {name: volumes[which] for which, name in overlays}
-    right, measured = (
-        nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(held[n]))) for n in ("right", "measured")
-    )
+    right, measured = (unpacked(held[name]) for name in ("right", "measured"))
     middle = right.get_fdata()[tuple(n // 2 for n in right.shape)]
     assert middle == pytest.approx(0.5 * np.hypot(0.4, 0.08), abs=0.005)  # the last of the loads, "Load2"
     assert measured.get_fdata()[tuple(n // 2 for n in right.shape)] == pytest.approx(middle, abs=0.005)

@@ -133,6 +133,7 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     factors = rows(section, "Credibility factors")
     assert "fat Ogden, mu0 10.54 kPa" in factors["Model form"][0]
     assert "P1, made from the label map with edges of 2.5 mm" in factors["Discretization error"][0]
+    assert str(section.tables).count("Residual forces at each converged increment") == 1
 
 
 def test_without_intervals_or_a_comparison_nothing_is_claimed(tmp_path: Path) -> None:
@@ -159,7 +160,7 @@ def test_input_uncertainty_that_is_in_the_intervals_is_told_with_the_models_that
 def test_mesh_convergence_takes_the_place_of_the_known_doubt(tmp_path: Path) -> None:
     found = "Mesh convergence of trebbi, cells of 3.0, 2.0, 1.5 mm, largest error of the finest mesh: p50 -2.0%."
     told = str(credibility_section(held({"t": simulation(tmp_path, "t")}, convergence=(found,))).tables)
-    assert told.count(found[:-1]) == 2
+    assert told.count(found[:-1]) == 1
     assert MESH_DOUBT not in told
     assert "onvergence: not given" not in told
 
@@ -173,6 +174,12 @@ def test_signs_of_other_inputs_are_told_and_those_of_the_measurement_are_not_tak
     assert of_measurement not in told
     sound = rows(credibility_section(held(folders, comparison=comparison("t"))), "Credibility factors")[FACTORS[9]]
     assert "no sign of another place, unit or frame" in sound[0]
+
+
+def test_a_sign_that_two_loads_share_is_told_once(tmp_path: Path) -> None:
+    one = comparison("t", reasons=("Load1: t seems to be in metres.", "Load2: t seems to be in metres."))
+    told = rows(credibility_section(held({"t": simulation(tmp_path, "t")}, comparison=one)), "Credibility factors")
+    assert told[FACTORS[9]][0].endswith("Inputs of the models: Load1, Load2: t seems to be in metres.")
 
 
 def test_what_was_used_for_calibration_is_found(tmp_path: Path) -> None:

@@ -74,14 +74,15 @@ def test_without_a_label_map_it_says_how_to_measure_all_the_same(tmp_path):
     assert not any("Without a label map" in line for line in NewStudy(tmp_path / "study.toml", LABELLED, "").summary())
 
 
-def test_with_a_mask_of_the_bone_the_study_makes_its_label_map(tmp_path):
-    made = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "calcaneus.nii.gz"))
+@pytest.mark.parametrize("bone", ["calcaneus", "tibia", "left femur", "bone-mask"])
+def test_with_a_mask_of_the_bone_the_study_makes_its_label_map(tmp_path, bone):
+    made = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", f"{bone}.nii.gz"))
     told = made.summary()
     assert "Labels: to be made from Load0 and the mask of the bone" in told
     assert not any("Without a label map" in line for line in told)
     study = read_study(made.path)
     assert study.makes_labels
-    assert study.images.bone == Path("calcaneus.nii.gz")
+    assert study.images.bone == Path(f"{bone}.nii.gz")
     assert study.mesh.bones == ()
     assert not any("names" in line and "FILL IN" in line for line in made.path.read_text().splitlines())
 

@@ -120,6 +120,20 @@ def test_a_registration_that_is_not_to_be_trusted_heads_the_report(study: Study)
     assert told.startswith("Heel Use with care In metres?")
 
 
+def test_the_table_of_stages_repeats_neither_reasons_nor_what_sections_tell(study: Study) -> None:
+    section = (Section("Load1", Verdict("trust")),)
+    registered = StageResult(("Load1: Trust.", "fat 0.131 / 0.425"), section, headline="0.131 median; Trust")
+    meshed = StageResult(("35399 tetrahedra", "bone 1200 faces"), headline="35399 tetrahedra")
+    why = "Not run: the engine is not installed."
+    outcomes = ended(study, register_Load1=registered, mesh=meshed, register_Load2=why, simulate_trebbi=why)
+    table = page_of(study, outcomes).split("<h3>Stages</h3>")[1].split("</table>")[0]
+    assert table.count(why) == 1
+    assert "<td>As register Load2.</td>" in table
+    assert "0.131 median; Trust" in table
+    assert "0.131 / 0.425" not in table
+    assert "35399 tetrahedra\nbone 1200 faces" in table  # no section tells it
+
+
 def test_without_a_verdict_nothing_is_claimed(study: Study) -> None:
     told = head(page_of(study, ended(study, register_Load1="The bone was not found.", register_Load2="Nor here.")))
     assert told.startswith(

@@ -81,8 +81,9 @@ def test_it_would_not_be_right_without_what_the_stages_took(clock: list[float], 
     assert max(ratios(RUNS["idle"], clock)) > 2.0
 
 
-def test_a_machine_of_another_speed_is_found_out_by_the_first_stages(clock: list[float]) -> None:
-    slow = {name: (3 * began, 3 * ended) for name, (began, ended) in RUNS["idle"].items()}
+@pytest.mark.parametrize("slower", [3, 10, 30])
+def test_a_machine_of_another_speed_is_found_out_by_the_first_stages(slower: int, clock: list[float]) -> None:
+    slow = {name: (slower * began, slower * ended) for name, (began, ended) in RUNS["idle"].items()}
     told = ratios(slow, clock)
     assert 0.5 <= min(told) <= max(told) <= 2.0
 

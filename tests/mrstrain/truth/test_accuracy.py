@@ -187,7 +187,7 @@ def test_a_study_that_is_told_to_end_leaves_no_process_behind(tmp_path: Path) ->
     with subprocess.Popen([*command, "--motion", "Load1", "--seed", "4"], **options) as running:
         try:
             for line in running.stderr:  # until elastix is at work
-                if b"accuracy: 1 registrations" in line:
+                if b"accuracy: 1 registration " in line:
                     break
             time.sleep(2.0)
             running.terminate()
