@@ -40,8 +40,9 @@ class Strip:
 def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     """Maximum shear strain in one slice of the unloaded anatomy under each load.
 
-    On the left, the unloaded image, or its label map if there is no image. White lines are the surfaces of the body and
-    of the bones. The image is grey where strain is not defined. The colour bar ends at the 98th percentile of all that is shown, rounded up to 0.05.
+    On the left, the unloaded image, or its label map if there is no image. White lines are the surfaces of the body
+    and of the bones. The image is grey where strain is not defined. The colour bar ends at the 98th percentile of all
+    that is shown, rounded up to 0.05.
     """
     # A row for each name; they are those of `Strip.max_shear`.
     first, many = strips[0], len(rows) > 1
