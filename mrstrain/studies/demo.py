@@ -28,7 +28,7 @@ _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam
 _COARSE = "tissues_to_mesh_coarse"
 _COARSE_MM = 1.2  # voxels of the label map that is meshed
 _PHANTOM_SHARE = {
-    False: 0.2,
+    False: 0.15,
     True: 0.01,
 }  # of the total time, for the coarse mesh (False) and the published size (True)
 _STUDY = """# Demonstration: a heel phantom whose strain is known at every point (see the folder truth).
