@@ -150,11 +150,11 @@ class Worker(AbstractContextManager["Worker", None]):
                     '(UseMultiThreadingForMetrics "false").'
                 ) from died
             except Exception as failure:
-                if not is_lack_of_memory(failure):
-                    raise
-                if isinstance(failure, BrokenProcessPool):  # there was none for a thread beside the process
+                if isinstance(failure, BrokenProcessPool):  # which takes no other task
                     executor.shutdown(wait=False, kill_workers=True)
                     self._executor = None
+                if not is_lack_of_memory(failure):
+                    raise
                 raise WorkerError(f"The memory ran out while {what} ({failure}). {TOO_LITTLE_MEMORY}") from failure
             finally:
                 if future is not None and not future.done():  # an interrupt: the task would be waited for

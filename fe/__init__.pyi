@@ -1,4 +1,13 @@
-from .convergence import ASSUMED_ORDER, SAFETY, SAFETY_WITHOUT_ORDER, Limit, cell_size_mm, extrapolate, mesh_steps
+from .convergence import (
+    ASSUMED_ORDER,
+    LEAST_RATIO,
+    SAFETY,
+    SAFETY_WITHOUT_ORDER,
+    Limit,
+    cell_size_mm,
+    extrapolate,
+    mesh_steps,
+)
 from .decks import write_calculix, write_febio
 from .fitting import LAWS, Curve, Fit, fit, read_curves
 from .from_dvc import InputError, MrstrainError, OutputError, TetMesh, WorkerError
@@ -16,9 +25,9 @@ from .simulation_files import begin_simulation
 from .solution import LoadState, Observer, SolverOptions, solve
 
 __all__ = [
-    "ASSUMED_ORDER", "BONE", "CUT", "LAWS", "MODES", "SAFETY", "SAFETY_WITHOUT_ORDER", "SKIN", "Checkpoint", "Curve",
-    "Fit", "Hencky", "InputError", "Limit", "LoadState", "LoadStep", "Material", "MaterialSet", "MeshQuality",
-    "MrstrainError", "NeoHooke", "Observer", "Ogden", "OutputError", "Plate", "PlateState", "Problem",
+    "ASSUMED_ORDER", "BONE", "CUT", "LAWS", "LEAST_RATIO", "MODES", "SAFETY", "SAFETY_WITHOUT_ORDER", "SKIN",
+    "Checkpoint", "Curve", "Fit", "Hencky", "InputError", "Limit", "LoadState", "LoadStep", "Material", "MaterialSet",
+    "MeshQuality", "MrstrainError", "NeoHooke", "Observer", "Ogden", "OutputError", "Plate", "PlateState", "Problem",
     "RegionFigures", "Simulation", "SolverOptions", "TetMesh", "Tolerance", "WorkerError", "Yeoh", "as_toml",
     "begin_simulation", "cauchy_stress", "cell_size_mm", "check_loads", "check_materials", "check_meshing",
     "equivalent_stress", "extrapolate", "fit", "fixed_facets", "material_set", "mesh_labels", "mesh_steps",

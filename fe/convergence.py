@@ -12,6 +12,8 @@ ASSUMED_ORDER = 1.0
 """Of the strain in linear cells, where meshes do not show one."""
 SAFETY, SAFETY_WITHOUT_ORDER = 1.25, 3.0
 """Factors of the grid convergence index; the second where three meshes or more show no order."""
+LEAST_RATIO = 1.1
+"""Of the cell sizes of two meshes; below, their difference is scatter and tells no error of the mesh."""
 _COVERAGE = 2.0  # of the expanded uncertainty that the index is
 _ORDERS = np.linspace(0.5, 2.0, 151)  # linear cells: displacement converges with the order 2, strain with 1
 _FEWEST = 3

@@ -35,7 +35,7 @@ _TONES: Mapping[Level | None, tuple[str, str]] = {
 _GREYS, _COLOURS = 24, 80  # steps of a volume's values: each takes room, of noise above all; a strain to .007 of .55
 _BLACK = 2.5  # steps of an image: below, it is air
 _QUALITY = 58  # of pictures on the page; files of figures lose nothing
-_WHITE, _CHART_COLOURS = 0.5, 64  # a chart: so much of it is white, and so many colours are enough
+_WHITE, _CHART_COLOURS = 0.5, 128  # a chart: so much of it is white, and so many colours are enough
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"
 """Version of the viewer (WebGL 2, niivue.com) that comes with the package; it draws what the page itself holds."""
@@ -232,7 +232,8 @@ def _small(png: bytes) -> str:
         pixels = picture.convert("RGB")
     files = [_webp(pixels, quality=_QUALITY)]
     if pixels.convert("L").histogram()[-1] > _WHITE * pixels.width * pixels.height:
-        few = pixels.quantize(_CHART_COLOURS, dither=Pixels.Dither.NONE)
+        # by colours, not by pixels: a mark of few pixels keeps its own
+        few = pixels.quantize(_CHART_COLOURS, Pixels.Quantize.MAXCOVERAGE, dither=Pixels.Dither.NONE)
         files.append(_webp(few.convert("RGB"), lossless=True))
     return "data:image/webp;base64," + base64.b64encode(min(files, key=len)).decode()
 

@@ -74,7 +74,8 @@ def converge(
     out : path
         Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and its figure, as PNG and
         PDF. An existing mesh that was made from the same label map is reused. The simulation on the second finest mesh
-        gets ``variant.toml``: `compare` takes it as the uncertainty of the finest mesh.
+        (with cells at least 1.1 times as large) gets ``variant.toml``: `compare` takes from it the uncertainty of the
+        finest mesh.
     loads, workers, progress
         As in `simulate`, with one material set.
 
@@ -127,7 +128,7 @@ def converge(
         on_meshes = {key: tuple(of[key] for of in values) for key in values[0]}
         rows = tuple(Row(*key, of, extrapolate(sizes, np.array(of))) for key, of in on_meshes.items())
         done = Converged(target, tuple(sizes.tolist()), rows)
-        _record_variant(done, *simulated[-2:])
+        _record_variant(done, simulated)
         _write(done, edges, provenance("converge", inputs, {"edges_mm": edges, "material": material}))
     return done
 
@@ -156,11 +157,20 @@ def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> 
         return False
 
 
-def _record_variant(done: Converged, coarse: Path, fine: Path) -> None:
-    """Record the solution on the second finest mesh as a variant of that on the finest, by the order of the strain."""
+def _record_variant(done: Converged, simulated: Sequence[Path]) -> None:
+    """Record the solution on the second finest mesh as a variant of that on the finest, by the order of the strain.
+
+    Meshes with cells of nearly the size of the finest are passed over; an earlier run's variants are removed.
+    """
+    finest, *coarser = np.argsort(done.sizes_mm)
+    ratios = {place: done.sizes_mm[place] / done.sizes_mm[finest] for place in coarser}
+    second = next(place for place, ratio in ratios.items() if ratio >= fe.LEAST_RATIO)
+    coarse, fine = simulated[second], simulated[finest]
+    for folder in done.out.glob("simulated-*"):
+        (folder / fine.name / VARIANT).unlink(missing_ok=True)
     orders = [row.limit.order for row in done.rows if row.figure.startswith(_SHEAR) and np.isfinite(row.limit.order)]
     of_order = (float(np.median(orders)), fe.SAFETY) if orders else (fe.ASSUMED_ORDER, fe.SAFETY_WITHOUT_ORDER)
-    steps = fe.mesh_steps(done.sizes_mm[-2] / done.sizes_mm[-1], *of_order)
+    steps = fe.mesh_steps(ratios[second], *of_order)
     write_whole(coarse / VARIANT, VariantRecord.of_folders(fine.name, MESH, steps, fine, coarse).text)
 
 

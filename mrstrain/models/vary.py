@@ -24,7 +24,6 @@ from mrstrain.options.model import Vector
 from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.outcome import Outcome
 
-_LEAST_RATIO = 1.1  # of cell sizes
 _SHORT = 0.2  # of the time of a whole solution: one that starts from the state of another
 _SKIN = "skin"
 
@@ -203,9 +202,9 @@ def _record_mesh(folder: Path, name: str, fine: TetMesh, coarse: TetMesh) -> str
     """Record the solution on the coarser mesh as a variant, unless the meshes are too similar; return a sentence."""
     ratio = fe.cell_size_mm(coarse) / fe.cell_size_mm(fine)
     told = f"mesh: cells of {fe.cell_size_mm(fine):.2f} and {fe.cell_size_mm(coarse):.2f} mm, a ratio of {ratio:.2f}"
-    if ratio < _LEAST_RATIO:
+    if ratio < fe.LEAST_RATIO:
         (folder / VARIANT).unlink(missing_ok=True)
-        return f"{told}; below {_LEAST_RATIO:g} no error of the mesh can be estimated."
+        return f"{told}; below {fe.LEAST_RATIO:g} no error of the mesh can be estimated."
     steps = fe.mesh_steps(ratio)
     _record(folder, name, MESH, steps, None)
     return f"{told}; one standard uncertainty is {1.0 / steps:.1f} times the difference of the two solutions."

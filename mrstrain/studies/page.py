@@ -163,7 +163,7 @@ def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for name, one in outcomes.items():
         told = first.setdefault(one.reason, name)
-        reason = f"As {told}." if one.reason and told != name else one.reason
+        reason = f"Same reason as for {told}." if one.reason and told != name else one.reason
         result = (one.result.headline,) if one.result.sections and one.result.headline else one.result.lines
         seconds = None if one.record is None else one.record.seconds
         rows.append((name, one.status, seconds, "\n".join((reason, *result)).strip()))

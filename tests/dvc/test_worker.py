@@ -85,7 +85,6 @@ def test_memory_of_a_freed_array_serves_the_next_even_below_a_worker_of_dask(mon
         assert worker.run("counting", _pages_of_freed_arrays) < 1000
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
 @pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
 def test_freed_memory_goes_back_to_the_system_between_tasks():
     process, blocks = psutil.Process(), [np.ones(12_000) for _ in range(2_000)]  # 192 MB, none of them a mapping
@@ -97,6 +96,7 @@ def test_freed_memory_goes_back_to_the_system_between_tasks():
     assert last[0] == 1.0
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
 def test_memory_that_runs_out_is_named_and_the_next_task_runs():
     with Worker(threads=1) as worker:
         with pytest.raises(WorkerError, match=r"memory ran out while registering Load1 \(.*16.*\)\. Free memory"):
@@ -158,6 +158,25 @@ def test_where_memory_lacks_for_a_thread_beside_the_process_the_next_task_runs(o
         time.sleep(2.0)  # a process that was left would have started by now
     told = "".join(capfd.readouterr())
     assert "Traceback" not in told, told
+
+
+class _NotForTheCaller:
+    """What a child can send and its caller cannot read."""
+
+    def __reduce__(self):
+        return _refused, (os.getpid(),)
+
+
+def _refused(maker: int) -> None:
+    if os.getpid() != maker:
+        raise ValueError("not here")
+
+
+def test_after_a_result_that_cannot_be_read_the_next_task_runs():
+    with Worker(threads=1) as worker:
+        with pytest.raises(process_executor.BrokenProcessPool, match="un-serialize"):
+            worker.run("meshing", _NotForTheCaller)
+        assert worker.run("adding", sum, [1, 2]) == 3
 
 
 def test_a_task_whose_answer_no_thread_takes_is_ended(monkeypatch):

@@ -147,7 +147,7 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
             given = " ".join(values)[:40]
             raise ParameterError(f"{name}: {parameter} takes whole numbers from {least} to {most}; it has '{given}'.")
     lengths = parameters.get(SPACING, ())
-    if not all(map(_is_length, lengths)):
+    if SPACING in parameters and not (lengths and all(map(_is_length, lengths))):
         given = " ".join(lengths)[:40]
         raise ParameterError(f"{name}: {SPACING} takes lengths above 0 mm; it has '{given}'.")
     if not parameters.get("Transform"):

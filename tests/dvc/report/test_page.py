@@ -7,12 +7,14 @@ import gzip
 import hashlib
 import io
 import re
+from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 
 import nibabel
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from PIL import Image as Pixels
 from scipy.ndimage import gaussian_filter
 
@@ -200,6 +202,22 @@ def test_a_picture_on_the_page_is_smaller_than_its_file_and_looks_the_same() -> 
         assert np.sqrt(np.mean((one - other) ** 2)) <= near
 
 
+def test_a_mark_of_few_pixels_keeps_its_colour_in_a_chart() -> None:
+    """Between lines of many shades it took the colour of one of them, another model's."""
+    figure, panels = chart(2, page_wide=True)
+    drawn_on(panels)
+    marks = {"#ff00ff": (255, 0, 255), "#ffee00": (255, 238, 0)}
+    for axes, colour in zip(panels, marks, strict=True):
+        axes.plot([0.5], [90.0], "o", color=colour, ms=2)
+    png_file = png_bytes(figure)
+    small = base64.b64decode(Picture("t", "c", png_file).small.removeprefix("data:image/webp;base64,"))
+    one, other = (np.asarray(Pixels.open(io.BytesIO(b)).convert("RGB"), float) for b in (png_file, small))
+    for colour in marks.values():
+        there = np.abs(one - colour).max(axis=-1) < 3
+        assert there.any()
+        assert np.abs(other[there] - colour).max() < 25
+
+
 def unpacked(data: str) -> nibabel.Nifti1Image:
     """A volume as a page holds it, its differences added up as the viewer does."""
     held = nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(data)))
@@ -211,10 +229,14 @@ def unpacked(data: str) -> nibabel.Nifti1Image:
 
 def chart_png() -> bytes:
     figure, panels = chart(2, page_wide=True)
+    drawn_on(panels)
+    return png_bytes(figure)
+
+
+def drawn_on(panels: Sequence[Axes]) -> None:
     for axes in panels:
         for name, look in looks(["bone", "fat", "muscle", "skin", "tendon"], TISSUES).items():
             axes.plot(np.linspace(0.0, 1.0, 400), np.random.default_rng(len(name)).random(400).cumsum(), **look.line)
-    return png_bytes(figure)
 
 
 def test_a_report_of_four_loads_and_six_models_has_room() -> None:

@@ -128,7 +128,7 @@ def test_the_table_of_stages_repeats_neither_reasons_nor_what_sections_tell(stud
     outcomes = ended(study, register_Load1=registered, mesh=meshed, register_Load2=why, simulate_trebbi=why)
     table = page_of(study, outcomes).split("<h3>Stages</h3>")[1].split("</table>")[0]
     assert table.count(why) == 1
-    assert "<td>As register Load2.</td>" in table
+    assert "<td>Same reason as for register Load2.</td>" in table
     assert "0.131 median; Trust" in table
     assert "0.131 / 0.425" not in table
     assert "35399 tetrahedra\nbone 1200 faces" in table  # no section tells it

@@ -63,6 +63,7 @@ def test_parameters_that_elastix_reads_are_accepted(tmp_path, line):
         ("(Number", "(MaximumStepLength 1e400)\n(Number", "has the value '1e400', which is not finite"),
         ("(Number", "(FinalGridSpacingInPhysicalUnits wide)\n(Number", "takes lengths above 0 mm; it has 'wide'"),
         ("(Number", "(FinalGridSpacingInPhysicalUnits 8 0 8)\n(Number", "takes lengths above 0 mm; it has '8 0 8'"),
+        ("(Number", '(FinalGridSpacingInPhysicalUnits "")\n(Number', "takes lengths above 0 mm; it has ''"),
         ("(Number", "(FinalGridSpacingInPhysicalUnits -8)\n(Number", "takes lengths above 0 mm; it has '-8'"),
         ("Resolutions 2", "Resolutions 2\0\0", "characters that are no text"),
         ('"BSplineTransform"', '""', r'\(Transform "\.\.\."\) is missing'),
