@@ -36,7 +36,7 @@ endif
 # Both cores to the end: a worker that has nothing left takes tests from the other, and each computes on one thread.
 THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=2
 PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
-# Else both workers, and the processes that they start, compile the same loops at the same time, 15 s long in each.
+# Otherwise both workers, and the processes that they start, compile the same loops at the same time, for 15 s each.
 COMPILED := $(THREADS) $(BIN)/python -c 'from dvc import GaussNewtonWithInterfaces; GaussNewtonWithInterfaces().prepare()'
 
 .DEFAULT_GOAL := help
@@ -48,7 +48,7 @@ help:
 
 setup: $(VENV)/installed.stamp
 
-# What is installed is compiled on all cores: pip would do so on one, and half a minute long.
+# What is installed is compiled on all cores. pip would use one core, and take half a minute.
 $(VENV)/dependencies.stamp: requirements.lock
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with the venv module was found on PATH." \
 		"Install one (on Debian and Ubuntu also python3-venv), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }

@@ -53,6 +53,7 @@ def format_parameters(parameters: Mapping[str, Sequence[Value]]) -> str:
     (Spacing 0.1 2)
     (UseDirectionCosines "true")
     """
+    # A spline has 100,000 numbers: plain ones are written without a call for each.
     return "".join(
         f"({name} {' '.join(repr(v) if type(v) is float else _formatted(name, v) for v in values)})\n"
         for name, values in parameters.items()
