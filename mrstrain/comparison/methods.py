@@ -271,8 +271,8 @@ def _of_inputs(comparison: Comparison) -> str:
     by_mesh, by_input = models_with(comparison, "u_num"), models_with(comparison, "u_input")
     if not by_mesh and not by_input:
         return ""
-    parts = [f"inputs of {_listed(by_input)}"] * bool(by_input)
-    parts += [f"the mesh of {_listed(by_mesh)} (grid convergence index, Roache 1994)"] * bool(by_mesh)
+    parts = [f"the inputs of {_listed(by_input)}"] if by_input else []
+    parts += [f"the mesh of {_listed(by_mesh)} (grid convergence index, Roache 1994)"] if by_mesh else []
     return (
         f"The uncertainty of {' and of '.join(parts)} was propagated linearly, from a further solution with each input "
         "changed, and is part of these intervals. The comparison error E = S - D and its standard uncertainties u_num, "

@@ -97,6 +97,9 @@ def test_how_inputs_were_carried_through_is_told_where_they_were_given(tmp_path:
     words = told(loads, models, errors=(exact, both, by_input))
     assert "inputs of both and theirs and of the mesh of both (grid convergence index, Roache 1994) was" in words
     assert "J Fluids Eng 116(3):405-413" in words
+    assert "The uncertainty of the inputs of theirs was" in told(loads, models, errors=(by_input,))
+    meshed = SimpleNamespace(model="meshed", u_num=0.1, u_input=np.nan)  # as from `converge`, which varies nothing else
+    assert "The uncertainty of the mesh of meshed (grid" in told(loads, models, errors=(exact, meshed))
 
 
 def test_directions_are_told_where_loads_do_not_share_them(tmp_path: Path) -> None:
