@@ -34,7 +34,7 @@ _SKIN = "skin"
 USUAL_SKIN = 3.0
 """Weight of strain in the skin, 1/mm3, to begin with; between those that loaded pairs get, 0.3 to 300."""
 _SKIN_POWERS = -5, 4  # of the square root of ten, times that: 0.01 to 300
-_SKIN_MARGIN = 3e-4  # of the left-out residual: skin is stiff unless the images say more than that against it
+_SKIN_MARGIN = 5e-4  # of the left-out residual: skin is stiff unless the images say more than that against it
 _STEPS = 3
 _LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps does it better with one
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
