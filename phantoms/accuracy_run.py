@@ -45,7 +45,8 @@ from phantoms.heel import (
 from phantoms.motions import ShearWave
 
 RIGID = ("bone", "ankle")
-_MADE, _ALIGNED, _REGISTERED = 0.2, 0.33, 0.95  # of the time of a run on one core, whatever the engine
+_MAKING_S, _ALIGNING_S = 16.0, 5.0  # of a run's `Cost.phantom_seconds`, before the engine begins
+_REGISTERED = 0.97  # of the time of a run
 _STRIDE = 2  # neighbouring voxels are strongly correlated: one in eight is kept
 _LAGS = 8
 _FORMAT = 3
@@ -201,9 +202,14 @@ def measure_run(
     MrstrainError
         If the pair cannot be made or registered.
     """
+    # A wave moves the bone too, so there is nothing to align on.
+    align_on = "bone" if case.wavelength_mm is None else "none"
+    settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
+    made = _MAKING_S / settings.engine.cost.phantom_seconds
+    aligned = made * (1.0 + _ALIGNING_S / _MAKING_S)
 
     def told(stage: str, fraction: float) -> None:
-        begun, ended = (_MADE, _ALIGNED) if stage == "aligning" else (_ALIGNED, _REGISTERED)
+        begun, ended = (made, aligned) if stage == "aligning" else (aligned, _REGISTERED)
         progress(begun + (ended - begun) * fraction)
 
     progress(0.0)
@@ -212,9 +218,6 @@ def measure_run(
         body = labels.labels > 0
         if label is not None:
             labels = label(reference, labels.region("bone"))
-    # A wave moves the bone too, so there is nothing to align on.
-    align_on = "bone" if case.wavelength_mm is None else "none"
-    settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
     if motion is None:
         settings = settings.of_repeat()
     elif case.keeps_volume:

@@ -11,7 +11,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 _FEW = 18  # letters of a cell that stays on one line
-_IN_BRACKETS = re.compile(r"\([^()]{1,24}\)")
+_INTERVAL = re.compile(r"\([-−+.\d]+(?: to |–)[-−+.\d]+\)")
 
 
 def stored(name: str) -> str:
@@ -33,12 +33,12 @@ def wrapping(cell: str) -> str:
 
 
 def unbroken(cell: str) -> Markup:
-    """The text of a cell whose brackets, such as an interval, each stay on one line.
+    """The text of a cell whose intervals in brackets each stay on one line.
 
     >>> unbroken("0.72 (0.00 to 1.33)")
     Markup('0.72 <span class="whole">(0.00 to 1.33)</span>')
     """
-    return Markup(_IN_BRACKETS.sub(r'<span class="whole">\g<0></span>', str(escape(cell))))
+    return Markup(_INTERVAL.sub(r'<span class="whole">\g<0></span>', str(escape(cell))))
 
 
 def packed(content: bytes) -> str:

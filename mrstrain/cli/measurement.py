@@ -157,7 +157,7 @@ def accuracy(
     ] = None,
     workers: Workers = None,
 ) -> None:
-    """Measure the error of an engine or preset on phantoms, by tissue, position and strain, and its noise and resolution.
+    """Measure the error of an engine or preset on phantoms, by tissue, position and strain; also noise and resolution.
 
     An interrupted study resumes. Default: 130 registrations with gauss-newton, nine motions and eight waves; voxels
     of 0.8 mm at SNR 25, 12 and 50, and of 1.2 mm and 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr, only
