@@ -5,6 +5,8 @@
 #   make test-all  the same with the tests that need full-size images or minutes
 #   make fuzz    every reader of files on damaged copies of small valid ones, a minute each (SECONDS=10 make fuzz)
 #   make audit   known vulnerabilities of the pinned dependencies (pip-audit in .venv-audit; it needs the package index)
+#   make oldest  tests on the oldest versions that pyproject.toml allows, in .venv-oldest (needs uv and the index);
+#   make newest  on the newest ones, in .venv-newest (TESTS=tests/dvc/io make newest: some of them)
 #   make clean-install  the wheel in an environment of its own that nobody can write to, without a display (needs the index)
 #   make setup   only the environment in .venv, redone when requirements.lock or pyproject.toml changes
 #   make lint    ruff, mypy and the import contract
@@ -25,6 +27,7 @@ SECONDS ?= 60
 SEED ?= 1
 UV ?= uv
 UPGRADE ?=
+TESTS ?=
 VENV := .venv
 QUIETLY := --disable-pip-version-check --quiet
 ifeq ($(OS),Windows_NT)
@@ -40,11 +43,11 @@ PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
 COMPILED := $(THREADS) $(BIN)/python -c 'from dvc import GaussNewtonWithInterfaces; GaussNewtonWithInterfaces().prepare()'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock audit clean-install docs peers clean
+.PHONY: help setup demo test test-all short-tests all-tests fuzz lint format lock audit oldest newest clean-install docs peers clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,18p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,20p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -107,6 +110,16 @@ audit: .venv-audit/installed.stamp
 	.venv-audit/$(notdir $(BIN))/python -m pip install --disable-pip-version-check --quiet "pip-audit>=2.10"
 	@touch $@
 
+# Of what pyproject.toml names; what that needs in turn is of the newest version. On Python 3.13:
+# make PYTHON=/path/to/python3.13 newest
+oldest: RESOLUTION := lowest-direct
+oldest: LENIENT := -W ignore::DeprecationWarning  # of newer versions, such as pyparsing's, about what old ones call
+newest: RESOLUTION := highest
+oldest newest:
+	$(UV) venv --quiet --clear --python "$(PYTHON)" .venv-$@
+	$(UV) pip install --quiet --python .venv-$@ --resolution $(RESOLUTION) --group dev -e .
+	$(THREADS) .venv-$@/$(notdir $(BIN))/python -m pytest -n 2 --dist worksteal -m "not full_size" $(LENIENT) $(TESTS)
+
 clean-install: setup
 	$(BIN)/python -m tests.clean_install
 
@@ -131,4 +144,4 @@ peers: .venv-peers/installed.stamp
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-docs .venv-peers .venv-audit site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist
+	rm -rf $(VENV) .venv-docs .venv-peers .venv-audit .venv-oldest .venv-newest site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist

@@ -39,9 +39,10 @@ class Assembler:
     """
 
     def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:
-        self.model = model
+        # Cells with the same nodes follow one another, so that what they add to is still in the cache.
+        self.model = model = model.in_order(np.argsort(model.space.cells.min(axis=1), kind="stable"))
         self._cells = model.unknowns_of_cells()
-        self._nodes = model.space.cells.copy()  # writable like its slices, so that kernels are compiled only once
+        self._nodes = model.space.cells
         free = np.ones(model.unknowns, dtype=bool)
         free[fixed] = False
         self._own = np.where(free, np.cumsum(free) - 1, -1)  # -1 where fixed

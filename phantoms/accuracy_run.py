@@ -45,6 +45,8 @@ from phantoms.heel import (
 from phantoms.motions import ShearWave
 
 RIGID = ("bone", "ankle")
+_MAKING_S, _ALIGNING_S = 16.0, 5.0  # of a run's `Cost.phantom_seconds`, before the engine begins
+_REGISTERED = 0.97  # of the time of a run
 _STRIDE = 2  # neighbouring voxels are strongly correlated: one in eight is kept
 _LAGS = 8
 _FORMAT = 3
@@ -190,7 +192,7 @@ def measure_run(
     computing : context manager
         Held while this process itself computes on all cores: a lock, where several cases are measured at once.
     progress : callable
-        ``progress(fraction)`` of the registration.
+        ``progress(fraction)`` of the run: the pair is made, aligned, registered and compared.
     label : callable, optional
         Makes the label map that the registration is given, numbered as `TISSUES`, from the unloaded image and the mask
         of its bone; its "bone" is the one that is aligned. By default, it is the phantom's own.
@@ -200,22 +202,29 @@ def measure_run(
     MrstrainError
         If the pair cannot be made or registered.
     """
+    # A wave moves the bone too, so there is nothing to align on.
+    align_on = "bone" if case.wavelength_mm is None else "none"
+    settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
+    made = _MAKING_S / settings.engine.cost.phantom_seconds
+    aligned = made * (1.0 + _ALIGNING_S / _MAKING_S)
+
+    def told(stage: str, fraction: float) -> None:
+        begun, ended = (made, aligned) if stage == "aligning" else (aligned, _REGISTERED)
+        progress(begun + (ended - begun) * fraction)
+
+    progress(0.0)
     with computing:
         reference, loaded, labels, motion = _phantom_pair(case)
         body = labels.labels > 0
         if label is not None:
             labels = label(reference, labels.region("bone"))
-    # A wave moves the bone too, so there is nothing to align on.
-    align_on = "bone" if case.wavelength_mm is None else "none"
-    settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
     if motion is None:
         settings = settings.of_repeat()
     elif case.keeps_volume:
         settings = replace(settings, engine=settings.engine.keeping_volume())
     registration = register(
         reference, loaded, bone=labels.region("bone"), tissue=Mask(labels.grid, labels.labels > 0), labels=labels,
-        settings=settings, worker=worker,
-        progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),
+        settings=settings, worker=worker, progress=told,
     )  # fmt: skip
     with computing:
         return sampled_errors(case, labels, body, motion, registration)

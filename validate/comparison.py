@@ -97,7 +97,7 @@ class Comparison:
             lines.append(f"{load}: area between strain-volume curves, mL, {order}: {listed}")
             for name, area in levelled.items():
                 before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
-                lines.append(f"{load}: {name} {area.ml:.2f} as measured; {before:.2f} without levelling")
+                lines.append(f"{load}: {name} {area.ml:.2f} by forward-model comparison, {before:.2f} directly")
         if len(self.coverage_ml) > 1 and self.ranking.areas:
             informative = ALL_LOADS not in self.ranking.uninformative
             listed = _listed(self.ranking.areas, self.ranking.nothing, informative)

@@ -126,7 +126,7 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     }
     cause = "the model itself is wrong: mesh, inputs and measurement do not explain the difference"
     if any(lacking.values()):
-        cause = "the measurement does not explain the difference. Inputs or meshes that are not given below might"
+        cause = "the measurement does not explain the difference, but inputs or meshes that are not given below may"
     words = [
         f"The comparison error exceeds the expanded validation uncertainty in {beyond} of {len(strains)} figures of "
         f"all models in all soft tissue. There, {cause}."

@@ -235,9 +235,9 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
         tuple(rows),
         "The best model over all loads is first; the rank is a range if models are not distinguishable. If the "
         "measurement uncertainty is known, the area is the median over the drawn true fields, with a 95 % interval. "
-        "Areas as measured and areas by tissue are given below and in areas.csv. Levelled models are last, with their "
-        "area as measured. The row below the line is a model that predicts zero strain everywhere; models that are no "
-        "better than it are marked in the column rank.",
+        "Areas as measured and areas by tissue are given below and in areas.csv. Models of a forward-model comparison "
+        "are last, with their area as measured. The row below the line is a model that predicts zero strain "
+        "everywhere; models that are no better than it are marked in the column rank.",
         (nothing,),
     )
 

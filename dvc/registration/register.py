@@ -48,7 +48,7 @@ class Settings:
     engine : Engine
         Engine of the non-rigid registration, with its parameters.
     align_on : {"bone", "image", "none"}
-        What is aligned rigidly first.
+        What the rigid alignment before the registration uses.
     seed : int
         Seed of every random number.
     threads : int

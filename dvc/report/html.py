@@ -3,10 +3,15 @@
 import base64
 import gzip
 import hashlib
+import re
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 
 import jinja2
+from markupsafe import Markup, escape
+
+_FEW = 18  # letters of a cell that stays on one line
+_INTERVAL = re.compile(r"\([-−+.\d]+(?: to |–)[-−+.\d]+\)")
 
 
 def stored(name: str) -> str:
@@ -20,6 +25,20 @@ def template(name: str, **filters: Callable[..., object]) -> jinja2.Template:
     environment = jinja2.Environment(autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= filters
     return environment.from_string(stored(f"{name}.html.j2"))
+
+
+def wrapping(cell: str) -> str:
+    """Class of a table's cell by its text: "whole" for a few words, which stay on one line of a narrow page."""
+    return "whole" if " " in cell and "(" not in cell and len(cell) <= _FEW else ""
+
+
+def unbroken(cell: str) -> Markup:
+    """The text of a cell whose intervals in brackets each stay on one line.
+
+    >>> unbroken("0.72 (0.00 to 1.33)")
+    Markup('0.72 <span class="whole">(0.00 to 1.33)</span>')
+    """
+    return Markup(_INTERVAL.sub(r'<span class="whole">\g<0></span>', str(escape(cell))))
 
 
 def packed(content: bytes) -> str:

@@ -18,7 +18,7 @@ from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.report.alike import alike
-from dvc.report.html import packed, policy, stored, template
+from dvc.report.html import packed, policy, stored, template, unbroken, wrapping
 from dvc.threads import usable_cores
 from dvc.trust.verdict import Level, Verdict
 
@@ -280,7 +280,7 @@ def write_report(
         list(pool.map(_small, (png for one in pictures for png in (one.png, *(png for _, png in one.beneath)))))
     style, script, library = stored("page.css"), stored("page.js"), _library() if volumes else None
     scripts = [script, library["script"], library["code"]] if library else [script]
-    page = template("report", alike=alike).render(
+    page = template("report", alike=alike, unbroken=unbroken, wrapping=wrapping).render(
         **told, sections=sections, volumes=volumes, style=style, script=script, library=library,
         policy=policy(style, scripts, viewer=bool(volumes)), reload_s=reload_s, beneath={},
     )  # fmt: skip

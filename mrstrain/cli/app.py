@@ -20,7 +20,8 @@ from mrstrain.cli.options import EXAMPLES, Grouped
 from mrstrain.cli.wrapping import wrapped
 
 _GREETING = """\
-mrstrain measures strain inside soft tissue from pairs of MR images, and compares finite-element models with it.
+mrstrain measures strain inside soft tissue from pairs of MR images, and compares finite-element
+models with it.
 
   mrstrain demo       see it work: a phantom heel, from images to report, in a few minutes
   mrstrain register   measure strain between your own images, unloaded and loaded
@@ -36,6 +37,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"max_content_width": 100},  # of help, in a terminal that is as wide
 )
 
 

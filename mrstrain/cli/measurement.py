@@ -157,11 +157,11 @@ def accuracy(
     ] = None,
     workers: Workers = None,
 ) -> None:
-    """Measure the error of an engine or preset on phantoms: by tissue, position and strain; noise floor; resolution.
+    """Measure the error of an engine or preset on phantoms, by tissue, position and strain; also noise and resolution.
 
     An interrupted study resumes. Default: 130 registrations with gauss-newton, nine motions and eight waves; voxels
-    of 0.8 mm at SNR 25, 12 and 50, and of 1.2 mm and 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr, only the
-    conditions given are measured; the other of the two is then 0.8 mm or 25.
+    of 0.8 mm at SNR 25, 12 and 50, and of 1.2 mm and 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr, only
+    the conditions given are measured. If only one of the two is given, the other is 0.8 mm or 25.
     """
     from dvc.registration.engines import DEFAULT
     from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES

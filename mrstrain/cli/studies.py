@@ -47,7 +47,7 @@ def init(
         bool, typer.Option("--yes", help="Ask no questions. Outside a terminal, none are asked anyway.")
     ] = False,
 ) -> None:
-    """Write a commented study file for the contents of a folder, and a picture of them.
+    """Write a commented study file for the images in a folder, and a picture of these images.
 
     In a terminal, asks for what the files do not contain: the bone, the forces and the plate's directions.
     """

@@ -47,7 +47,8 @@ class Meshed:
         if q.least_angle_deg < _CARE_ANGLE_DEG:
             lines.append(f"WARNING: the smallest dihedral angle is {q.least_angle_deg:.1f} degrees.")
         lines += [
-            f"{share:.0%} of the cells of {name} extend through its whole thickness; give a finer edge length there."
+            f"{share:.0%} of the cells of {name} extend through its whole thickness; give a shorter edge length there "
+            "(--finer)."
             for name, share in q.thin
         ]
         lines += [

@@ -58,8 +58,8 @@ class GivenLabels(Options):
     panel: ClassVar[str] = "Inputs"
 
     labels: Path | None = None
-    """Label map. Without --from, it is that of this image and is corrected: the boundaries of its bones and skin move
-    to where the image shows them, by up to 2.5 voxels. With --from, it is that of that image and is transferred."""
+    """Label map. Without --from: the one of this image, which is corrected. The boundaries of its bones and skin move
+    by up to 2.5 voxels to where the image shows them. With --from: the one of that image, which is transferred."""
     names: Path | None = None
     """Table of its label names: ITK-SNAP, Slicer or CSV."""
     from_image: Annotated[Path | None, Cli(name="--from")] = None
@@ -75,7 +75,7 @@ class SubjectFiles(BoneAndBody):
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
-    """Label map of the tissues on the unloaded image. With register, auto makes it from the image and --bone."""
+    """Label map of the tissues on the unloaded image. For register, auto makes it from the image and --bone."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
 
@@ -125,11 +125,11 @@ class RegistrationOptions(EngineOptions):
     """How loaded images are registered to the unloaded one."""
 
     align: Literal["bone", "image", "none"] = "bone"
-    """What is aligned rigidly before the registration."""
+    """What the rigid alignment before the registration uses: the bone, the whole image, or nothing."""
     bending: Positive | None = None
     """gauss-newton: weight of the bending penalty, 1/mm. Default: chosen for each pair by cross-validation."""
     volume: NotNegative | None = None
-    """gauss-newton: weight of the volume-change penalty, 1/mm3. Default: 300, relaxed where the images indicate a
+    """gauss-newton: weight of the volume-change penalty, 1/mm3. Default: 300, relaxed if the images indicate a
     volume change."""
     chain: Flag = False
     """Start each load from the result of the one before it, in the order given."""

@@ -57,7 +57,7 @@ class Meshing(Options):
     edge_mm: Positive = 2.0
     """Edge length of the cells, mm. Above about four voxels a longer edge changes little."""
     finer: Finer | None = None
-    """Another edge length in one region, mm, such as: skin 1."""
+    """Region with an edge length of its own, mm, such as: skin 1."""
     limit_s: Annotated[Positive, _limit("Stop meshing after this time, minutes.")] = 3600.0
     """Stop meshing after this time, s."""
 
@@ -120,7 +120,7 @@ class PlateOptions(Directions):
     turns: Flag = False
     """Let the plate rotate freely about its pivot."""
     pivot_mm: Annotated[Vector | None, Cli("--pivot")] = None
-    """Point over which the pivot of the plate is placed, LPS mm. Default: the first point of contact."""
+    """Point whose projection onto the plate is the pivot, LPS mm. Default: the first point of contact."""
 
 
 class MaterialSets(Options):
@@ -172,7 +172,7 @@ class ModelReading(Options):
     model_frame: Frame = "LPS"
     """Frame of the model coordinates."""
     leave_out: Names = ()
-    """Name of a region of the models that is no tissue, such as a plate; rigid regions are left out anyway."""
+    """Name of a region of the models that is not tissue, such as a plate. Rigid regions are always left out."""
     unfinished: Flag = False
     """Also compare results of FEBio and CalculiX whose run ended early."""
 

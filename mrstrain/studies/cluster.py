@@ -36,6 +36,7 @@ _TRACKER = "resource_tracker"  # removes the semaphores of processes that are go
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
 _NOTHING_LOGGED = logging.CRITICAL + 1  # by Dask, as of each message that there is no memory for: stages tell of theirs
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
+_STARTS_S = 900.0  # for a worker whose process starts: over two minutes where ten others want the same core
 # A stage hangs that tells nothing new for this long, and for this many times what the rest of its study should take.
 _SILENT_S, _SILENT_TIMES = 3600.0, 10.0
 _NAME_EVERY_S = 600.0  # a stage that tells nothing new
@@ -83,7 +84,8 @@ class StageRunner:
 
     def __init__(self, client: Client, watch: OnProgress, local: LocalCluster | None = None) -> None:
         self._client, self._watch = client, watch
-        self._local = local  # the cluster, if it is of this machine and nobody else's work is on it
+        # What watches the workers, if they are of this machine and nobody else's work is on them.
+        self._nannies: Mapping[Any, Nanny] = local.workers if local is not None else {}
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
@@ -136,7 +138,9 @@ class StageRunner:
                     break
                 left = self._client.status == "running" and self._client.nthreads()
                 lost_since = None if left else lost_since or time.monotonic()
-                if lost_since is not None and time.monotonic() - lost_since > _LOST_S:
+                lost_s = 0.0 if lost_since is None else time.monotonic() - lost_since
+                starts = lost_s > _LOST_S and any(map(_processes_of, self._nannies.values()))
+                if lost_s > (_STARTS_S if starts else _LOST_S):
                     future = next(iter(self._under_way))
                     return self._under_way.pop(future).name, "The scheduler, or every worker, has stopped.", 0.0
                 if hung := self._hung():
@@ -190,7 +194,7 @@ class StageRunner:
         cancelled = [future for future in self._under_way if future.key in held]
         calls = [self._under_way.pop(future) for future in cancelled]
         self._client.cancel(cancelled)
-        for nanny in self._local.workers.values() if self._local is not None else ():
+        for nanny in self._nannies.values():
             if nanny.worker_address in places:  # what hangs in native code would not notice that its worker is gone
                 _kill(_processes_of(nanny)[1:])
         self._client.restart_workers([*places], raise_for_error=False)

@@ -119,7 +119,7 @@ class Registering(RegistrationOptions):
     """Options of the registration, as those of `register`."""
 
     align: Literal["bone", "image"] = "bone"
-    """What is aligned rigidly before the registration."""
+    """What the rigid alignment before the registration uses: the bone or the whole image."""
 
 
 class Mesh(modelling.Meshing, modelling.Labelling, modelling.MeshCoordinates):

@@ -100,7 +100,7 @@ def test_a_registration_names_no_patient(inputs: Path, registered: Path) -> None
     assert planted_in(registered) == []
     page = (registered / "out" / "report.html").read_text()
     section = page.split("<h2>Acquisition and measurement</h2>")[1].split("</details>")[0]
-    rows = dict(re.findall(r"<th scope=row>([^<]*)</th>\s*<td>([^<]*)</td>", section))
+    rows = dict(re.findall(r"<th scope=row[^>]*>([^<]*)</th>\s*<td[^>]*>([^<]*)</td>", section))
     assert rows["Scanner, manufacturer"] == "Siemens (unloaded image); not given (Load1, repeat)"
     assert rows["Scanner, model"] == rows["Sequence, name"] == "not given"
     assert rows["Field strength, T"] == "not given (unloaded image, Load1); 3 (repeat)"

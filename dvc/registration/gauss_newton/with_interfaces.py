@@ -78,7 +78,7 @@ def fit_with_interfaces(
     choice = Choice(in_skin.weights, "bending fixed beforehand")
     if parameters.bending is None:
         choice = choose(stage.slab, coefficients, in_skin.weights)
-    rule = f"{choice.rule}; in skin {in_skin.rule}" if stage.has_skin else choice.rule
+    rule = f"{choice.rule}. In skin, {in_skin.rule}" if stage.has_skin else choice.rule
     in_bone = None if pair.bone is None else _moved(smooth, pair.bone)
     choice = replace(
         choice, rule=rule, tried_in_skin=in_skin.tried, at_interfaces=True, asked=first.asked, in_bone=in_bone

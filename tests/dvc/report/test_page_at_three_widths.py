@@ -61,6 +61,19 @@ CUT_OFF = """[...document.querySelectorAll("figure img")].filter((one) => one.ch
   return Math.max(seen.left - whole.left, whole.right - seen.right, whole.right - innerWidth);
 }).filter((pixels) => pixels > 0.5)"""
 """Pixels by which pictures are wider than their figure, or than the window."""
+BROKEN = """[...document.querySelectorAll("td, th")].flatMap((cell) => {
+  const text = cell.textContent, from = text.indexOf("("), range = document.createRange();
+  if (!cell.checkVisibility() || from < 0 && (text.length > 18 || cell.closest("thead"))) return [];
+  const walk = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT), tops = new Set();
+  while (walk.nextNode()) {
+    if (from >= 0 && !walk.currentNode.data.includes("(")) continue;
+    range.setStart(walk.currentNode, Math.max(walk.currentNode.data.indexOf("("), 0));
+    range.setEnd(walk.currentNode, walk.currentNode.data.length);
+    [...range.getClientRects()].forEach((line) => tops.add(Math.round(line.top)));
+  }
+  return tops.size > 1 ? [text] : [];
+})"""
+"""Short cells, and intervals in brackets, that are broken between lines."""
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
 
 
@@ -78,11 +91,15 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     image, strain = Volume.image("Load0", grid, values, 1.0), Volume.overlay("max. shear", grid, values, 1.0)
     columns = ("tissue", *(f"a long name of column {n}" for n in range(12)))
     table = Table("Strain", columns, (("fat", *(0.1 * n for n in range(12))),), "A note.", (("all", *(None,) * 12),))
+    areas = Table(
+        "Areas", ("model", "where", *(f"Load{n}" for n in range(6))),
+        tuple((model, "0 to 3 mm", *6 * ("0.72 (0.00 to 1.33)",)) for model in ("trebbi", "no deformation")),
+    )  # fmt: skip
     picture = Picture("Strain", "How to read it.", png(), (("unloaded", png()), ("Load1, registered", png())))
     doubtful = Verdict("caution", ("Bone moves by 0.4 mm (use with care above 0.3 mm).",))
     sections = [
         Section("Load1", Verdict("trust"), (table,), (picture,), ("What was found.",), summary=table),
-        Section("Load2", doubtful, folded=True),
+        Section("Load2", doubtful, (areas,), folded=True),
         Section("Load3", Verdict("distrust", ("The deformation folds.",)), folded=True),
         Section("In space", folded=True, viewers=(Viewer("Strain", "To turn.", image, (strain,)),)),
     ]
@@ -107,6 +124,7 @@ def test_the_page_fits_and_its_text_is_legible(tab: Tab, page: Path, width: int,
     tab.value(UNFOLD)
     assert tab.value(TOO_WIDE) <= 0
     assert tab.value(CUT_OFF) == []
+    assert tab.value(BROKEN) == []
     assert tab.value(PALE) == []
     shot = base64.b64decode(tab.call("Page.captureScreenshot", captureBeyondViewport=True)["data"])
     (tmp_path / f"report-{width}.png").write_bytes(shot)  # to be looked at

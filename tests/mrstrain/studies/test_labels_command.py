@@ -125,9 +125,11 @@ def test_what_a_command_leaves_behind_is_ended(tmp_path):
     """Also where that holds the command's output open, and does not listen."""
     (tmp_path / "stays.sh").write_text("trap '' TERM\necho $$ > left\nexec sleep 1000\n")
     began = time.monotonic()
-    assert run_command(["sh", "-c", "sh stays.sh & sleep 1; echo done"], tmp_path, lambda _: None) == (0, "done\n")
+    command = "sh stays.sh & until [ -s left ]; do sleep 0.1; done; echo done"
+    assert run_command(["sh", "-c", command], tmp_path, lambda _: None) == (0, "done\n")
     assert time.monotonic() - began < 60.0
-    assert is_gone(int((tmp_path / "left").read_text()))
+    # Killed by then, but it ends only when it gets a core.
+    wait_for(lambda: is_gone(int((tmp_path / "left").read_text())), limit_s=60.0)
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")

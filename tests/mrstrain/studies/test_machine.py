@@ -29,7 +29,7 @@ from mrstrain.studies.run import _log
 from mrstrain.studies.stages import StageResult
 from tests.mrstrain.studies import test_pipeline
 from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
-from tests.processes import is_gone, wait_for
+from tests.processes import ended_process, is_gone, wait_for
 
 if sys.platform != "win32":
     import resource
@@ -259,6 +259,31 @@ def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):
     runner.begin("small", "mesh", {}, tmp_path / "lock")
     assert [runner.next()[0] for _ in range(2)] == ["small", "big"]
     assert not runner.busy
+
+
+@pytest.mark.parametrize("starts", [True, False])
+def test_a_worker_that_takes_long_to_start_is_waited_for(tmp_path, monkeypatch, starts):
+    """On a machine with too much to do it takes minutes; a worker that has no process is not waited for as long."""
+    monkeypatch.setattr(cluster, "_LOOK_EVERY_S", 0.01)
+    monkeypatch.setattr(cluster, "_LOST_S", 0.05)
+    waiting, machine = Future(), Machine()
+    waiting.status = "pending"
+    monkeypatch.setattr(machine, "submit", lambda *_, **__: waiting)
+    looks = iter(range(50))
+
+    def nthreads() -> dict[str, int]:
+        time.sleep(0.01)
+        if next(looks) == 20:  # after .2 s
+            waiting.status = "finished"
+            waiting.set_result((StageResult(("meshed",)), 1.0))
+        return {}
+
+    monkeypatch.setattr(machine, "nthreads", nthreads)
+    nanny = SimpleNamespace(pid=os.getpid() if starts else ended_process())
+    runner = StageRunner(machine, lambda *_: None, SimpleNamespace(workers={0: nanny}))
+    runner.begin("mesh", "mesh", {}, tmp_path / "lock")
+    _, outcome, _ = runner.next()
+    assert outcome == (StageResult(("meshed",)) if starts else "The scheduler, or every worker, has stopped.")
 
 
 def test_results_that_are_removed_under_a_run_are_not_recorded(folder, monkeypatch):

@@ -75,7 +75,9 @@ def seen(study: Study, monkeypatch: pytest.MonkeyPatch) -> Seen:
 
 def states(page: str) -> dict[str, tuple[str, str]]:
     """State and finding of each stage, as the page has them."""
-    rows = re.findall(r"<th scope=row>([^<]*)</th><td>([^<]*)</td><td>([^<]*)</td></tr>", page.split("Stages</h3>")[1])
+    rows = re.findall(
+        r"<th scope=row[^>]*>([^<]*)</th><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td></tr>", page.split("Stages</h3>")[1]
+    )
     return {name: (state, found) for name, state, found in rows}
 
 

@@ -35,6 +35,7 @@ from phantoms import (
     motion_named,
     stretched,
 )
+from phantoms.accuracy_run import _phantom_pair
 from tests.phantoms.test_error_tables import CASE, samples
 from tests.quick import QUICK
 
@@ -64,6 +65,30 @@ def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
     assert 1.0 < ours < 0.6 * elastix < 6.0
     assert 1.5 * ours < borders < elastix  # two fits and a choice more
     assert expected_minutes([CASE] * 10, 1) == pytest.approx(2.0 * elastix)
+
+
+@pytest.mark.parametrize(("preset", "share"), [("gauss-newton", 0.53), ("heel-mr", 0.21)])
+def test_progress_begins_before_the_pair_is_made_and_counts_what_comes_before_the_registration(
+    preset: str, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case, told = replace(CASE, preset=preset, spacing_mm=(4.0, 4.0, 4.0)), list[float]()
+
+    def made(case: AccuracyCase) -> tuple[Any, ...]:
+        assert told == [0.0]  # the clock of the time left runs
+        return _phantom_pair(case)
+
+    def registered(*_: object, progress: Any, **__: object) -> None:
+        for stage, fraction in (("aligning", 0.0), ("aligning", 1.0), ("registering", 0.5), ("registering", 1.0)):
+            progress(stage, fraction)
+
+    monkeypatch.setattr("phantoms.accuracy_run._phantom_pair", made)
+    monkeypatch.setattr("phantoms.accuracy_run.register", registered)
+    monkeypatch.setattr("phantoms.accuracy_run.sampled_errors", lambda *_: samples(case))
+    measure_run(case, SimpleNamespace(threads=1), nullcontext(), told.append)  # type: ignore[arg-type]
+    _, making, aligned, half, whole = told
+    assert making == pytest.approx(share, abs=0.01)  # measured of the processor time at 0.8 mm: .57 and .28
+    assert making < aligned < half < whole < 1.0
+    assert half == pytest.approx(0.5 * (aligned + whole))
 
 
 @pytest.mark.usefixtures("in_this_process")
