@@ -4,9 +4,10 @@
 
 The stages of a small study (a heel at 2.3 mm, a mesh of 9 mm; with --pad the smaller pad of the golden record) run one
 after another in the Dask worker that a study runs in: so many registrations, then so many simulations. Told after every
-ten, between two stages, is what the process tree holds: resident memory, open files, threads, files in the kernel's
-shared memory that carry the number of one of its processes, and files in its folder for temporary files (Linux only).
-Told at the end is what is open then and was not after the first ten, by its kind. Results are written after every ten.
+ten, between two stages, is what the process tree holds: resident memory, and the part of it that is not of files; open
+files, threads, files in the kernel's shared memory that carry the number of one of its processes, and files in its
+folder for temporary files (Linux only). Told at the end is what is open then and was not after the first ten, by its
+kind. Results are written after every ten.
 """
 
 from __future__ import annotations
@@ -73,6 +74,12 @@ def opened() -> Counter[str]:
     return kinds
 
 
+def anonymous_kib(pid: int) -> int:
+    """Resident memory of a process that is not that of files, such as libraries, whose pages the system takes back."""
+    (kib,) = re.findall(r"^RssAnon:\s+(\d+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    return int(kib)
+
+
 def held() -> dict[str, float]:
     """What this process and all below it hold."""
     tree = [psutil.Process(), *psutil.Process().children(recursive=True)]
@@ -80,6 +87,7 @@ def held() -> dict[str, float]:
     return {
         "processes": len(tree),
         "resident_mib": round(sum(one.memory_info().rss for one in tree) / 2**20, 1),
+        "anonymous_mib": round(sum(anonymous_kib(one.pid) for one in tree) / 2**10, 1),
         "open_files": sum(one.num_fds() for one in tree),
         "threads": sum(one.num_threads() for one in tree),
         "shared_memory_files": sum(not numbers.isdisjoint(re.findall(r"\d+", one.name)) for one in SHARED.iterdir()),

@@ -55,8 +55,10 @@ _SETTINGS = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
     # Semaphores of a worker that was ended are removed by loky's tracker, which need not tell of it.
     "distributed.nanny.pre-spawn-environ.PYTHONWARNINGS": "ignore:resource_tracker:UserWarning",
-    # Of its own memory and load it keeps an hour, in each process, and nobody looks at it.
+    # It keeps an hour of its own memory and load, and a thousand steps of stages that ended: nobody looks at them.
     "distributed.admin.system-monitor.log-length": 10,
+    "distributed.admin.low-level-log-length": 10,
+    "distributed.diagnostics.computations.max-history": 1,
     "logging.distributed": "error",
 }
 
@@ -84,8 +86,7 @@ class StageRunner:
 
     def __init__(self, client: Client, watch: OnProgress, local: LocalCluster | None = None) -> None:
         self._client, self._watch = client, watch
-        # What watches the workers, if they are of this machine and nobody else's work is on them.
-        self._nannies: Mapping[Any, Nanny] = local.workers if local is not None else {}
+        self._nannies: Mapping[Any, Nanny] = local.workers if local is not None else {}  # of workers for this run alone
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more

@@ -261,6 +261,18 @@ def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):
     assert not runner.busy
 
 
+def test_dask_keeps_no_record_of_stages_that_have_ended(tmp_path):
+    """Of each it kept 24 KiB in this process and 7 KiB in the worker, for a thousand steps of each."""
+    with cluster.cluster(lambda *_: None, [tmp_path], workers=1) as runner:
+        for number in range(15):
+            runner.begin(f"mesh {number}", "no_stage", {}, tmp_path / "lock")
+            runner.next()
+        there = runner._client.run_on_scheduler(lambda dask_scheduler: [*dask_scheduler.transition_log])
+        (at_work,) = runner._client.run(lambda dask_worker: len(dask_worker.state.stimulus_log)).values()
+    assert 0 < len(there) <= 10
+    assert 0 < at_work <= 10
+
+
 @pytest.mark.parametrize("starts", [True, False])
 def test_a_worker_that_takes_long_to_start_is_waited_for(tmp_path, monkeypatch, starts):
     """On a machine with too much to do it takes minutes; a worker that has no process is not waited for as long."""
