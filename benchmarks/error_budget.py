@@ -141,11 +141,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--rows", nargs="+", help="only these rows, by name")
+    parser.add_argument("--motions", nargs="+", help="only these motions, such as trebbi-Load1 or flow-Load3")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
     rows = [row for row in ROWS if given.rows is None or row.name in given.rows]
-    budget = {f"{kind or 'flow'}-{load}": measured(given.work, kind, seed, load, rows) for kind, seed, load in MOTIONS}
+    named = {f"{kind or 'flow'}-{load}": (kind, seed, load) for kind, seed, load in MOTIONS}
+    budget = {name: measured(given.work, *of, rows) for name, of in named.items() if name in (given.motions or named)}
     if given.out is not None:
         given.out.write_text(json.dumps({"versions": versions(), "error_and_bias": budget}, indent=1) + "\n")
 
