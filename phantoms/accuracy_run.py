@@ -205,7 +205,7 @@ def measure_run(
     # A wave moves the bone too, so there is nothing to align on.
     align_on = "bone" if case.wavelength_mm is None else "none"
     settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
-    made = _MAKING_S / settings.engine.cost.phantom_seconds
+    made = _MAKING_S / max(settings.engine.cost.phantom_seconds, 1.4 * (_MAKING_S + _ALIGNING_S))
     aligned = made * (1.0 + _ALIGNING_S / _MAKING_S)
 
     def told(stage: str, fraction: float) -> None:

@@ -140,7 +140,8 @@ class StageRunner:
                 left = self._client.status == "running" and self._client.nthreads()
                 lost_since = None if left else lost_since or time.monotonic()
                 lost_s = 0.0 if lost_since is None else time.monotonic() - lost_since
-                starts = lost_s > _LOST_S and any(map(_processes_of, self._nannies.values()))
+                answers = self._client.status == "running"
+                starts = answers and lost_s > _LOST_S and any(map(_processes_of, self._nannies.values()))
                 if lost_s > (_STARTS_S if starts else _LOST_S):
                     future = next(iter(self._under_way))
                     return self._under_way.pop(future).name, "The scheduler, or every worker, has stopped.", 0.0

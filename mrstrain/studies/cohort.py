@@ -48,7 +48,8 @@ class Cohort:
     def summary(self) -> list[str]:
         """Summary, a few lines."""
         lines = [f"{one.study.study.name}: incomplete, see {one.study.out}" for one in self.ran if not one.complete]
-        lines.append("Normalised area of each model, mean over the subjects and 95 % interval:")
+        if self.ranking:
+            lines.append("Normalised area of each model, mean over the subjects and 95 % interval:")
         lines += [
             f"{place}. {s.model}: {100 * s.mean:z.2f} % ({100 * s.low:z.2f} to {100 * s.high:z.2f}), best in "
             f"{s.nearest_in} of {s.subjects} subjects"

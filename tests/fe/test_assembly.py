@@ -226,33 +226,6 @@ def test_no_step_folds_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.state[moved] == pytest.approx(np.full(len(moved), -4.8))
 
 
-def test_newton_ends_when_its_further_steps_would_be_small() -> None:
-    """A block pulled by a fifth: the last step is larger than the tolerance, and equilibrium closer than that."""
-    model = model_of("P1", layers=1)
-    x = model.space.nodes_mm[:, 0]
-    moved = unknowns(np.flatnonzero(np.isclose(x, 8.0)), 0)
-    assembler = Assembler(model, unknowns(np.flatnonzero(np.isclose(x, 0.0)), 0, 1, 2), {0: moved})
-    assembler.share({0: moved})
-
-    def pulled(tolerance: Tolerance) -> tuple[np.ndarray, list[float]]:
-        told = []
-        found = equilibrium(
-            assembler, Solver(assembler.indptr, assembler.indices), np.zeros(model.unknowns),
-            Imposed(np.zeros(assembler.size), np.array([assembler.own_equations]), np.array([1.6])), tolerance,
-            log=told.append,
-        )  # fmt: skip
-        assert found is not None
-        return found.state[: 3 * len(x)], [float(line.split("step ")[1].split()[0]) for line in told]
-
-    exact_mm, _ = pulled(Tolerance(force=1e-10, step_mm=1e-10))
-    larger = 0
-    for step_mm in np.geomspace(1e-1, 1e-4, 7):
-        reached_mm, steps_mm = pulled(Tolerance(force=1.0, step_mm=step_mm))
-        assert np.abs(reached_mm - exact_mm).max() < step_mm
-        larger += steps_mm[-1] > step_mm
-    assert larger > 2, steps_mm
-
-
 @pytest.mark.parametrize(
     "library", [pytest.param("pardiso", marks=needs_mkl), pytest.param("ngsolve", marks=needs_ngsolve)]
 )

@@ -201,10 +201,6 @@ def test_balance_alone_does_where_steps_do_not_get_small(sheared: list[LoadState
     assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-3
 
 
-def test_tissue_touches_while_its_balance_is_sought(sheared: list[LoadState]) -> None:
-    assert sheared[0].iterations <= 14  # 17 if it first comes near to balance, and then touches
-
-
 def test_normal_first_then_shear() -> None:
     alone, after = (press(dome(), loads)[-1] for loads in ([SHEARED], [*PRESS, SHEARED]))
     assert np.abs(alone.u_mm - after.u_mm).max() < 1e-6
