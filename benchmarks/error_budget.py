@@ -86,7 +86,7 @@ ROWS = (
 MOTIONS = (("trebbi", 7, "Load1"), ("stiff-skin", 7, "Load1"), ("", 3, "Load3"), ("", 3, "smooth"))
 
 
-def moved(work: Path, kind: str, seed: int, load: str, labels: LabelMap) -> tuple[Motion, Deformation]:
+def moved(work: Path, kind: str, seed: int, load: str) -> tuple[Motion, Deformation]:
     """The motion that makes the image, and the truth that the strain is compared with."""
     if kind not in KINDS:
         motion = motion_named(Heel(seed), load)
@@ -109,7 +109,7 @@ def measured(work: Path, kind: str, seed: int, load: str, rows: list[Row]) -> di
     """The budget of one motion."""
     heel, grid = Heel(seed), heel_grid(VOXEL_MM)
     labels = labels_of(heel, grid)
-    motion, true = moved(work, kind, seed, load, labels)
+    motion, true = moved(work, kind, seed, load)
     number, body = zlib.crc32(f"{kind}-{load}".encode()), labels.labels > 0
     foot, found = random_foot_motion(seed, number), {}
     case = AccuracyCase(ENGINE, VOXEL_MM, SNR, f"{kind}-{load}", seed)
@@ -140,13 +140,13 @@ def measured(work: Path, kind: str, seed: int, load: str, rows: list[Row]) -> di
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--rows", nargs="+", help="only these rows, by name")
-    parser.add_argument("--motions", nargs="+", help="only these motions, such as trebbi-Load1 or flow-Load3")
+    named = {f"{kind or 'flow'}-{load}": (kind, seed, load) for kind, seed, load in MOTIONS}
+    parser.add_argument("--rows", nargs="+", choices=[row.name for row in ROWS], help="only these rows")
+    parser.add_argument("--motions", nargs="+", choices=list(named), help="only these motions")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
     rows = [row for row in ROWS if given.rows is None or row.name in given.rows]
-    named = {f"{kind or 'flow'}-{load}": (kind, seed, load) for kind, seed, load in MOTIONS}
     budget = {name: measured(given.work, *of, rows) for name, of in named.items() if name in (given.motions or named)}
     if given.out is not None:
         given.out.write_text(json.dumps({"versions": versions(), "error_and_bias": budget}, indent=1) + "\n")
