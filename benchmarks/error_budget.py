@@ -23,15 +23,16 @@ from scipy.ndimage import binary_dilation
 
 from benchmarks.hidden_law import as_motion, truth
 from benchmarks.unforeseen import KINDS, SOFT, VOXEL_MM, simulated
-from dvc import Deformation, Image, LabelMap, Mask, RigidMotion, Settings, register
+from dvc import Deformation, GaussNewtonWithInterfaces, Image, LabelMap, Mask, RigidMotion, Settings, register
 from dvc.deformation.protocol import Motion
-from dvc.registration.gauss_newton.engine import GaussNewtonWithInterfaces
 from dvc.worker import Worker
 from mrstrain.records.provenance import versions
 from phantoms import (
+    FAT_SIGNAL,
     TISSUES,
     AccuracyCase,
     Heel,
+    acquire,
     covering,
     heel_grid,
     labels_of,
@@ -39,9 +40,8 @@ from phantoms import (
     random_foot_motion,
     sampled_errors,
 )
-from phantoms.anatomy import FAT_SIGNAL
 from phantoms.heel import octants
-from phantoms.mri import acquire, sampled_by
+from phantoms.mri import sampled_by
 from validate import read_result
 
 ENGINE, SNR, NEAR_MM = "gauss-newton-borders", 25.0, 1.5
