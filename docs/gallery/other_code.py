@@ -1,4 +1,4 @@
-"""A model of another code, in metres and RAS, read into the frame of the image."""
+"""A model from another code, in metres and RAS, read into the frame of the image."""
 
 import matplotlib.pyplot as plt
 import meshio

@@ -11,7 +11,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 _FEW = 18  # letters of a cell that stays on one line
-_INTERVAL = re.compile(r"\([-−+.\d]+(?: to |–)[-−+.\d]+\)")
+_INTERVAL = re.compile(r"\([-−+.\d]+(?: to |–)[-−+.\d]+(?: ?[%A-Za-z]+[²³]?)?\)")
 
 
 def stored(name: str) -> str:
@@ -37,6 +37,8 @@ def unbroken(cell: str) -> Markup:
 
     >>> unbroken("0.72 (0.00 to 1.33)")
     Markup('0.72 <span class="whole">(0.00 to 1.33)</span>')
+    >>> unbroken("3.0 mm (2.1 to 4.0 mm)")
+    Markup('3.0 mm <span class="whole">(2.1 to 4.0 mm)</span>')
     """
     return Markup(_INTERVAL.sub(r'<span class="whole">\g<0></span>', str(escape(cell))))
 

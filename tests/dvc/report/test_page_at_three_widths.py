@@ -28,11 +28,13 @@ PALE = """(() => {
     return 0.2126 * r + 0.7152 * g + 0.0722 * b;
   };
   const ground = (node) => {
-    for (; node; node = node.parentElement) {
-      const colour = getComputedStyle(node).backgroundColor, alpha = channels(colour)[3] ?? 1;
-      if (alpha > 0) return colour;
+    const layers = [];
+    for (; node && (layers.at(-1)?.[3] ?? 0) < 1; node = node.parentElement) {
+      const [r, g, b, alpha = 1] = channels(getComputedStyle(node).backgroundColor);
+      if (alpha > 0) layers.push([r, g, b, alpha]);
     }
-    return "rgb(255, 255, 255)";
+    const over = (below, above) => below.map((c, k) => above[3] * above[k] + (1 - above[3]) * c);
+    return `rgb(${layers.reduceRight(over, [255, 255, 255])})`;
   };
   const texts = document.createTreeWalker(document.querySelector(".page"), NodeFilter.SHOW_TEXT), pale = [];
   let seen = 0;
