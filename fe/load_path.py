@@ -27,7 +27,11 @@ _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
 _LEAST_APPROACH_MM = 0.01
 _ALONG_NORMAL = np.array([True, False, False])
-_ENOUGH = (0.2, 0.4, 0.6, 0.8)  # fractions of the normal load up to which the plate is displacement controlled
+# Fraction of the normal load up to which the plate is displacement controlled, so that nodes touch it in order. A plate
+# that rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
+_ENOUGH, _RELEASED = (0.8,), (0.2, 0.4, 0.6, 0.8)
+_AIM = 0.9  # of the normal load, for the last step on the way there
+_ROUGH_FORCE, _ROUGH_STEP = 10.0, 30.0  # factors on the tolerance of increments on the way there
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +101,7 @@ class LoadPath:
         """Make contact, press to a fraction of the normal load, and release a rotating plate; whether to continue."""
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
-        for share in _ENOUGH:  # on a node or two the plate would tip over: it stays parallel until more nodes touch
+        for share in _RELEASED if self.contact.plate.turns else _ENOUGH:
             if target.displaced[0]:
                 way = target.values - self._start_mm
                 part = PlateTarget(self._start_mm + share * way, target.displaced).unsheared()
@@ -130,12 +134,12 @@ class LoadPath:
             self._back(level)
         return left == 0.0
 
-    def raise_to(self, target: PlateTarget) -> bool:
-        """Continue to the target, in steps as large as converge; whether it is reached."""
+    def raise_to(self, target: PlateTarget, first: float = _FIRST_STEP) -> bool:
+        """Continue to the target, in steps as large as converge, the first a given fraction; whether it is reached."""
         before = self.reached(target)
         way = target.values - before  # displacement steps are small, so that nodes come into contact in order
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
-        done, step, downhill = 0.0, _FIRST_STEP, False
+        done, step, downhill = 0.0, first, False
         least = min(_LEAST_STEP, 0.01 * largest)
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
             step = min(step, largest)
@@ -155,29 +159,47 @@ class LoadPath:
     def _push(self, enough_n: float, most_n: float) -> None:
         """Move the plate along its normal until its force is ``enough_n`` or cannot rise; never above ``most_n``."""
         farthest = self.plate.displacement_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
-        step, growth = _APPROACH_MM, _GROWTH
-        while self.plate.force_n[0] < enough_n and step > _LEAST_APPROACH_MM and not self.is_over():
+        largest, exact = _MOST_APPROACH_MM, self.tolerance
+        rough = replace(exact, force=_ROUGH_FORCE * exact.force, step_mm=_ROUGH_STEP * exact.step_mm)
+        while self.plate.force_n[0] < enough_n and largest > _LEAST_APPROACH_MM and not self.is_over():
+            step = min(largest, self._to_next_stop(), self._to_force(_AIM * most_n))
             if farthest - self.plate.displacement_mm[0] < step:
                 break
             last = self.increment
             aim = np.array([self.plate.displacement_mm[0] + step, *self.plate.force_n[1:]])
-            if self._go(_ALONG_NORMAL, aim) and self.plate.force_n[0] < most_n:
-                step = min(growth * step, _MOST_APPROACH_MM)
+            if self._go(_ALONG_NORMAL, aim, tolerance=rough) and self.plate.force_n[0] < most_n:
                 self._log("moved")
                 self.on_converged()
             else:
                 self._back(last)
-                step, growth = _SHRINK * step, 1.0
+                largest = _SHRINK * step
+
+    def _to_force(self, force_n: float) -> float:
+        """Step of the approach to a force, mm, if the force goes on to grow by the same factor with each mm."""
+        before, now = self.curve[-2:] if len(self.curve) > 1 else 2 * self.curve
+        if not now.force_n[0] > before.force_n[0] > 0.0:
+            return np.inf
+        rates = np.log([now.force_n[0] / before.force_n[0], force_n / now.force_n[0]])
+        return float((now.displacement_mm[0] - before.displacement_mm[0]) * rates[1] / rates[0])
+
+    def _to_next_stop(self) -> float:
+        """Step of the approach, mm; its stops are the same wherever it is resumed, and so are the nodes that touch."""
+        moved_mm = self.plate.displacement_mm[0] - self._start_mm[0]
+        stop, step = 0.0, _APPROACH_MM
+        while stop < moved_mm + _LEAST_APPROACH_MM:
+            stop, step = stop + step, min(_GROWTH * step, _MOST_APPROACH_MM)
+        return float(stop - moved_mm)
 
     def _go(
-        self, displaced: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0, *, downhill: bool = False
-    ) -> bool:
+        self, displaced: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0, *, downhill: bool = False,
+        tolerance: Tolerance | None = None,
+    ) -> bool:  # fmt: skip
         """Find equilibrium with displacements (mm) along some of the plate's axes and forces (N) along the others.
 
         A freely rotating plate also gets a moment (3,), N mm. ``downhill`` uses `fe.descent`, which needs forces along
         all axes and a plate that does not rotate. If no equilibrium is found, the state is restored.
         """
-        contact, before = self.contact, self.contact.status
+        contact, before, tolerance = self.contact, self.contact.status, tolerance or self.tolerance
         contact.begin(self.state)
         equations = self.assembler.own_equations + np.arange(3)
         outside = np.zeros(self.assembler.size)
@@ -193,13 +215,13 @@ class LoadPath:
 
         system = self.assembler, self.solver, self.state
         if downhill:
-            converged = descend(*system, outside, self.tolerance, changed, self.log, self.is_over)
+            converged = descend(*system, outside, tolerance, changed, self.log, self.is_over)
         else:
             rotation = Parallel()
             if contact.status.turns:
                 rotation = Turning(contact, self.assembler, self.solver, np.broadcast_to(moment_nmm, 3))
             imposed = Imposed(outside, equations[displaced], (aim - self.plate.displacement_mm)[displaced])
-            converged = equilibrium(*system, imposed, self.tolerance, changed, self.log, rotation)
+            converged = equilibrium(*system, imposed, tolerance, changed, self.log, rotation)
         if converged and np.abs(contact.displacement_mm(converged.state) - self._start_mm).max() > self.extent_mm:
             self.log("rejected: the plate would have moved by more than the size of the body")
             converged = None
@@ -300,10 +322,11 @@ class Loading:
     def run(self) -> bool:
         """Load up to the target, normal first, then shear; whether it is reached."""
         path, target = self._path, self._target
-        goals = [target.unsheared(), target] if self._first and target.sheared else [target]
-        stages = [partial(path.raise_to, goal) for goal in goals]
-        if self._first:
-            stages.insert(0, partial(path.approach, target))
+        stages = [partial(path.raise_to, target)]
+        if self._first:  # the approach comes near to the normal force, unless the plate rotates
+            near = not (path.contact.plate.turns or target.displaced[0])
+            pressed = partial(path.raise_to, target.unsheared(), 1.0 if near else _FIRST_STEP)
+            stages = [partial(path.approach, target), pressed, *(stages if target.sheared else [])]
         for stage in stages[self._stages :]:
             if not stage():
                 return False

@@ -153,6 +153,8 @@ class Problem:
     materials : mapping of region to Material
     loads : sequence of LoadStep
         In sequence: each starts from the state of the previous one. The first must press.
+    passed : sequence of LoadStep
+        Smaller loads without shear that the first load passes, in ascending order; it continues from the last of them.
 
     Raises
     ------
@@ -168,6 +170,7 @@ class Problem:
     loads: Sequence[LoadStep]
     fixed: Sequence[str] = (BONE,)
     element: str = "P1"
+    passed: Sequence[LoadStep] = ()
 
     def __post_init__(self) -> None:
         formulation(self.element)
@@ -204,6 +207,9 @@ def problems_of(
 ) -> list[Problem]:  # fmt: skip
     """One problem for each load path (`fe.paths_of`); ``plate`` is one for all loads, or a mapping from load names.
 
+    A path whose plate stays parallel passes the smaller loads without shear of the same plate. Solve paths with fewer
+    of them first, and give their states to the others.
+
     Raises
     ------
     InputError
@@ -215,7 +221,24 @@ def problems_of(
         )
     plate_of = {load.name: plate if isinstance(plate, Plate) else plate[load.name] for load in loads}
     paths = paths_of(loads, {name: tuple(one.axes.round(9).ravel()) for name, one in plate_of.items()})
-    return [Problem(mesh, materials, plate_of[path[0].name], path, fixed, element) for path in paths]
+    return [
+        Problem(mesh, materials, plate_of[path[0].name], path, fixed, element, _passed(path[0], loads, plate_of))
+        for path in paths
+    ]
+
+
+def _passed(first: LoadStep, loads: Sequence[LoadStep], plate_of: Mapping[str, Plate]) -> tuple[LoadStep, ...]:
+    """Loads without shear that a load passes, in ascending order: smaller, of an equal plate that stays parallel."""
+
+    def pressed(load: LoadStep) -> tuple[Hashable, ...]:
+        plate = plate_of[load.name]
+        return bool(load.target.displaced[0]), tuple(plate.axes.ravel()), plate.gap_mm, plate.taped, plate.turns
+
+    if plate_of[first.name].turns:
+        return ()
+    like = [load for load in loads if not load.sheared and pressed(load) == pressed(first)]
+    smaller = {float(load.target.values[0]): load for load in like if load.target.values[0] < first.target.values[0]}
+    return tuple(smaller[value] for value in sorted(smaller))
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:

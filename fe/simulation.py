@@ -185,7 +185,7 @@ class Simulation:
         plates = []
         for state in self.states:
             moved, along, _ = state.plate_displacement_mm
-            sheared = f" and {along:z.1f} along" if state.load.sheared else ""
+            sheared = f" (along the shear {along:z.1f})" if state.load.sheared else ""
             part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%} of the load)"
             plates.append(f"{state.load.name} {moved:z.1f}{sheared}{part}")
         return f"plate displacement, mm: {', '.join(plates)}"
@@ -362,7 +362,8 @@ def simulate(
         With its outward normal and direction of shear, LPS; both are needed, even without shear.
     loads : sequence of LoadStep
         Forces (N) or plate displacements (mm) along these directions. Loads with the same normal force are simulated as
-        one load path, in the order of their shear (`fe.paths_of`).
+        one load path, in the order of their shear (`fe.paths_of`). The first load of a path continues from the largest
+        smaller load without shear, unless the plate rotates freely.
     fixed : sequence of str
         Fixed surface sets.
     element : {"P1", "MINI", "P2"}
@@ -395,4 +396,10 @@ def simulate(
     problems = problems_of(mesh, by_region, plate, loads, fixed, element)
     for note in (*notes, *(note for one in problems for note in one.notes)):
         observer.log(note)
-    return Simulation.of(chosen, problems, [s for one in problems for s in solve(one, options, observer)])
+    known: dict[str, LoadState] = {}
+    for one in sorted(problems, key=lambda problem: len(problem.passed)):
+        if all(load.name in known and known[load.name].reached == 1.0 for load in one.passed):
+            earlier = [at for load in one.passed if (at := known[load.name].checkpoint)]
+            known |= {state.load.name: state for state in solve(one, options, observer, earlier)}
+    names = [load.name for one in problems for load in one.loads]
+    return Simulation.of(chosen, problems, [known[name] for name in names if name in known])

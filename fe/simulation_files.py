@@ -106,9 +106,9 @@ def begin_simulation(folder: Path) -> None:
     write_json(folder / RECORD, {"outcome": {}})
 
 
-def fingerprint(problem: Problem, load_count: int) -> str:
-    """A hash of everything that the first loads of a problem depend on, with solver and libraries (`dvc.software`)."""
-    mesh, plate = problem.mesh, problem.plate
+def fingerprint(problem: Problem, last: LoadStep) -> str:
+    """A hash of everything that a load of a problem depends on, with solver and libraries (`dvc.software`)."""
+    mesh, plate, loads = problem.mesh, problem.plate, (*problem.passed, *problem.loads)
     digest = hashlib.sha256()
 
     def add(*things: object) -> None:
@@ -122,7 +122,7 @@ def fingerprint(problem: Problem, load_count: int) -> str:
     for region, material in problem.materials.items():
         add(region, material.vector, material.nu)
     add(plate.axes, plate.gap_mm, plate.taped, plate.turns, np.asarray(plate.pivot_mm, dtype=np.float64))
-    add(*(astuple(load)[1:] for load in problem.loads[:load_count]))
+    add(*(astuple(load)[1:] for load in loads[: loads.index(last) + 1]))
     add(tuple(problem.fixed), problem.element, software_key("fe"))
     return digest.hexdigest()
 

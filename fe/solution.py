@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -125,17 +125,17 @@ def solve(
     options, observer : optional
         Threads, time limit and tolerance; and the observer that receives the progress.
     earlier : sequence of Checkpoint
-        Checkpoints of the first loads, from an earlier solution of the same problem. These loads are not solved again;
-        the last one may be incomplete and is continued.
+        Checkpoints of the first loads, those that are passed included, from an earlier solution of the same problem.
+        These loads are not solved again; the last one may be incomplete and is continued.
 
     Returns
     -------
     list of LoadState
-        One for each load. A load that cannot be reached is the last in the list, with its last converged increment and
-        ``reached`` below 1.
+        One for each load, without those that are passed. A load that cannot be reached is the last in the list, with
+        its last converged increment and ``reached`` below 1. It is empty if a load that is passed cannot be reached.
     """
     options, observer = options or SolverOptions(), observer or Observer()
-    mesh, loads, axes = problem.mesh, problem.loads, problem.plate.axes
+    mesh, loads, axes = problem.mesh, (*problem.passed, *problem.loads), problem.plate.axes
     turned = TetMesh(mesh.points_mm @ axes, mesh.cells, mesh.regions, mesh.facets)
     model = Model.of(turned, problem.materials, element(problem.element))
     deadline = time.monotonic() + options.limit_s
@@ -144,25 +144,35 @@ def solve(
     )
     u_count, node_count = 3 * len(model.space.nodes_mm), len(mesh.points_mm)
     states: list[LoadState] = []
+    before: Checkpoint | None = None
     try:
         for number, load in enumerate(loads):
+            own = number >= len(problem.passed)
 
-            def on_converged(checkpoint: Checkpoint, done: float, number: int = number, load: LoadStep = load) -> None:
+            def on_converged(
+                checkpoint: Checkpoint, done: float, number: int = number, load: LoadStep = load, own: bool = own
+            ) -> None:
                 observer.progress((number + done) / len(loads))
-                observer.converged(load, checkpoint)
+                if own:
+                    observer.converged(load, checkpoint)
 
-            before = states[-1].load.target if states else None
-            loading = Loading(path, load.target, before, dict(enumerate(earlier)).get(number), on_converged)
+            known = dict(enumerate(earlier)).get(number)
+            if before is not None and not states and known is None:  # the load that it passes is an increment of it
+                known = replace(before, stages=0)
+            loading = Loading(path, load.target, states[-1].load.target if states else None, known, on_converged)
             complete = loading.run()
             observer.progress((number + 1.0) / len(loads))
-            at, held = loading.checkpoint(), path.contact.held
-            state = LoadState(
-                load, at.reached, at.unknowns[:u_count].reshape(-1, 3)[:node_count] @ axes.T,
-                model.pressures(at.unknowns).mean(axis=1), axes @ model.gradients(at.unknowns) @ axes.T,
-                held[held < node_count], at.curve, at.iterations, at.seconds, at, not complete and path.is_over(), axes,
-            )  # fmt: skip
-            states.append(state)
-            observer.ended(state)
+            before, held = loading.checkpoint(), path.contact.held
+            if own:
+                at = before
+                state = LoadState(
+                    load, at.reached, at.unknowns[:u_count].reshape(-1, 3)[:node_count] @ axes.T,
+                    model.pressures(at.unknowns).mean(axis=1), axes @ model.gradients(at.unknowns) @ axes.T,
+                    held[held < node_count], at.curve, at.iterations, at.seconds, at, not complete and path.is_over(),
+                    axes,
+                )  # fmt: skip
+                states.append(state)
+                observer.ended(state)
             if not complete:
                 break
     finally:

@@ -124,7 +124,8 @@ def simulate(
             make_output(folder)
             held_folders.enter_context(alone(folder))
             _remove_earlier(folder, plates)
-        each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
+        in_order = sorted(jobs, key=lambda job: len(job[1].passed))  # what others pass comes first
+        each_in_workers(in_order, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
         kind = WorkerError if run.died == run.failures.keys() else MrstrainError
         raise kind(with_reasons("Every simulation failed.", [f"{n}: {r}" for n, r in run.failures.items()]))
@@ -201,10 +202,12 @@ class _Run:
                 if share.exists():
                     self.progress(case, "simulating", float(share.read_text() or 0.0))
 
+            states: list[fe.LoadState] = []
             try:
-                states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
+                if not self._passed_in_vain(chosen, problem):
+                    states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
             except MrstrainError as failure:
-                states, self.failures[case] = [], str(failure)
+                self.failures[case] = str(failure)
                 self.died.update({case} if isinstance(failure, WorkerError) else ())
         with self.writing:
             self.ended[id(problem)] = states
@@ -212,6 +215,14 @@ class _Run:
             if all(id(one) in self.ended for one in problems):
                 self._write(chosen, problems)
         self.progress(case, "simulating", 1.0)
+
+    def _passed_in_vain(self, chosen: fe.MaterialSet, problem: fe.Problem) -> bool:
+        """Whether another path has ended without a load that this one passes."""
+        others = [(one, self.ended[id(one)]) for of, one in self.jobs if of is chosen and id(one) in self.ended]
+        lost = {load for one, _ in others for load in one.loads} - {
+            state.load for _, states in others for state in states if state.reached == 1.0
+        }
+        return bool(lost & set(problem.passed))
 
     def _write(self, chosen: fe.MaterialSet, problems: Sequence[fe.Problem]) -> None:
         states = [state for one in problems for state in self.ended[id(one)]]
@@ -252,16 +263,18 @@ class _Files(fe.Observer):
     def __init__(self, problem: fe.Problem, folder: Path, share: Path) -> None:
         self._problem, self._folder, self._share = problem, folder, share
         self._log = folder / f"log-{problem.loads[0].name}.txt"
-        self._made_from = {load.name: fingerprint(problem, n) for n, load in enumerate(problem.loads, start=1)}
+        self._made_from = {load.name: fingerprint(problem, load) for load in (*problem.passed, *problem.loads)}
         self._last = time.monotonic()
         write_whole(self._log, "")
 
     def earlier(self) -> list[fe.Checkpoint]:
-        """Checkpoints of the first loads from an earlier run; the last load may be incomplete."""
+        """Checkpoints of the first loads from an earlier run or path; the last own load may be incomplete."""
         kept: list[fe.Checkpoint] = []
-        for load in self._problem.loads:
+        for load in (*self._problem.passed, *self._problem.loads):
             checkpoint = read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
             if checkpoint is None or (kept and kept[-1].reached < 1.0):
+                break
+            if load in self._problem.passed and checkpoint.reached < 1.0:  # another path may be solving it now
                 break
             self.log(f"{load.name}: resumed at {checkpoint.reached:.0%} from an earlier run")
             kept.append(checkpoint)

@@ -132,7 +132,7 @@ def _solve_short(
     failed = []
     with Worker(threads=1) as worker:
         for number, (name, (problems, steps)) in enumerate(changed.items(), start=1):
-            folder, made_from = out / name / chosen, [fingerprint(one, len(one.loads)) for one in problems]
+            folder, made_from = out / name / chosen, [fingerprint(one, one.loads[-1]) for one in problems]
             if not _is_made(folder, made_from, states):
                 (folder / VARIANT).unlink(missing_ok=True)
                 try:
@@ -219,8 +219,8 @@ def _states(setting: _Setting, folder: Path) -> dict[str, fe.Checkpoint]:
     """States of the unchanged problem, of the loads that it reached."""
     states = {}
     for problem in setting.problems():
-        for number, load in enumerate(problem.loads, start=1):
-            state = read_checkpoint(folder / f"{load.name}{ENDING}", fingerprint(problem, number))
+        for load in problem.loads:
+            state = read_checkpoint(folder / f"{load.name}{ENDING}", fingerprint(problem, load))
             if state is not None and state.reached == 1.0:
                 states[load.name] = state
     return states
