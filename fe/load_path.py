@@ -177,7 +177,7 @@ class LoadPath:
     def _to_force(self, force_n: float) -> float:
         """Step of the approach to a force, mm, if the force goes on to grow by the same factor with each mm."""
         before, now = self.curve[-2:] if len(self.curve) > 1 else 2 * self.curve
-        if not now.force_n[0] > before.force_n[0] > 0.0:
+        if not force_n > now.force_n[0] > before.force_n[0] > 0.0:
             return np.inf
         rates = np.log([now.force_n[0] / before.force_n[0], force_n / now.force_n[0]])
         return float((now.displacement_mm[0] - before.displacement_mm[0]) * rates[1] / rates[0])

@@ -105,6 +105,7 @@ def test_nodes_touch_in_the_order_of_small_steps(monkeypatch: pytest.MonkeyPatch
         fine.setattr("fe.load_path._MOST_APPROACH_MM", 0.05)
         fine.setattr("fe.load_path._APPROACH_MM", 0.05)
         fine.setattr("fe.load_path._ENOUGH", (0.98,))
+        fine.setattr("fe.load_path._AIM", 0.99)
         small = nodes()
     with monkeypatch.context() as coarse:
         coarse.setattr("fe.load_path._ENOUGH", (0.2,))
