@@ -137,11 +137,8 @@ def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:
         groups.setdefault(run.case.motion if several else run.case.seed, []).append(run)
     if len(groups) < 2:
         return []
-    return [
-        _validated(run, tissue, _table([r for other, some in groups.items() if other != group for r in some]))
-        for group, mine in groups.items()
-        for run, tissue in _large(mine)
-    ]
+    tables = {group: _table([r for other, some in groups.items() if other != group for r in some]) for group in groups}
+    return [_validated(run, tissue, tables[group]) for group, mine in groups.items() for run, tissue in _large(mine)]
 
 
 def _large(runs: Sequence[ErrorSamples]) -> list[tuple[ErrorSamples, str]]:
