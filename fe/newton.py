@@ -18,6 +18,7 @@ _MOST_GROWTH = 3.0  # of the residual in one step
 # second the search stops.
 _WANDERED, _LOST = 2, 12
 BALANCED, SMALL_MM = 5, 0.1  # also converged: so many consecutive steps within the force tolerance, the last this small
+_LINGERED, _CLOSE = 8, 10.0  # or so many within so many times the tolerance
 _SHARES = (1.0, 0.5, 0.25)
 _ROUGH, _INEXACT = 0.05, 1e-3  # tolerance of the linear solver, far from equilibrium and near it
 
@@ -31,8 +32,9 @@ class Tolerance:
     force : float
         Largest norm of the residual forces, as a fraction of the forces on the plate and the fixed nodes.
     step_mm : float
-        Largest change of a displacement in the last step, mm. Five consecutive steps within ``force``, the last below
-        0.1 mm, are also accepted, because the nodes of a nearly flat cell may move almost without force.
+        Largest change of a displacement in the last step, mm. Five consecutive steps within ``force``, or eight within
+        ten times it, the last below 0.1 mm, are also accepted, because the nodes of a nearly flat cell may move almost
+        without force.
     iterations : int
         Largest number of iterations.
     """
@@ -77,7 +79,7 @@ def equilibrium(
     now, left = newton.at(state.copy()), imposed.moves_mm.copy()
     if not now.lowest > 0.0:
         return None
-    wandering, balanced, balance = 0, 0, 0.0
+    wandering, balanced, close, balance = 0, 0, 0, 0.0
     for iteration in range(1, tolerance.iterations + 1):
         try:
             step = newton.step(now, left, _ROUGH if balance > _NEAR else _INEXACT)
@@ -97,15 +99,18 @@ def equilibrium(
         if wandering >= _LOST:
             return None
         if left.any() or balance > _NEAR:
+            close = 0
             continue
         if changed(now.state, now.forces):
-            now, balanced = newton.at(now.state), 0
+            now, balanced, close = newton.at(now.state), 0, 0
             continue
         balanced = balanced + 1 if balance <= tolerance.force else 0
+        close = close + 1 if balance <= _CLOSE * tolerance.force else 0
         if balanced and share == 1.0 and largest <= tolerance.step_mm:
             return Converged(now.state, now.forces, iteration)
-        if balanced >= BALANCED and largest <= SMALL_MM:
-            log(f"    accepted: {balanced} consecutive steps within the force tolerance, the last of {largest:.1e} mm")
+        if (balanced >= BALANCED or close >= _LINGERED) and largest <= SMALL_MM:
+            within = f"{balanced} consecutive steps within" if balanced >= BALANCED else f"{close} within ten times"
+            log(f"    accepted: {within} the force tolerance, the last of {largest:.1e} mm")
             return Converged(now.state, now.forces, iteration)
     return None
 

@@ -201,6 +201,17 @@ def test_balance_alone_does_where_steps_do_not_get_small(sheared: list[LoadState
     assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-3
 
 
+def test_a_state_that_lingers_near_the_tolerance_is_taken(
+    monkeypatch: pytest.MonkeyPatch, sheared: list[LoadState]
+) -> None:
+    monkeypatch.setattr("fe.newton.BALANCED", 1000)
+    heard = Notebook()
+    (state,) = press(dome(), PRESS, tolerance=Tolerance(1e-4, 0.0), observer=heard)
+    assert state.reached == 1.0
+    assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-3
+    assert any("accepted: 8 within ten times the force tolerance" in line for line in heard.lines)
+
+
 def test_normal_first_then_shear() -> None:
     alone, after = (press(dome(), loads)[-1] for loads in ([SHEARED], [*PRESS, SHEARED]))
     assert np.abs(alone.u_mm - after.u_mm).max() < 1e-6
