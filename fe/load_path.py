@@ -134,6 +134,12 @@ class LoadPath:
             self._back(level)
         return left == 0.0
 
+    def press(self, target: PlateTarget) -> bool:
+        """Continue to the normal load, in one step if the approach has come near; whether it is reached."""
+        free = self.contact.plate.turns or target.displaced[0]
+        near = not free and self.plate.force_n[0] >= _ENOUGH[0] * target.values[0]
+        return self.raise_to(target.unsheared(), 1.0 if near else _FIRST_STEP)
+
     def raise_to(self, target: PlateTarget, first: float = _FIRST_STEP) -> bool:
         """Continue to the target, in steps as large as converge, the first a given fraction; whether it is reached."""
         before = self.reached(target)
@@ -166,7 +172,7 @@ class LoadPath:
             if farthest - self.plate.displacement_mm[0] < step:
                 break
             last = self.increment
-            aim = np.array([self.plate.displacement_mm[0] + step, *self.plate.force_n[1:]])
+            aim = np.array([self.plate.displacement_mm[0] + step, 0.0, 0.0])
             if self._go(_ALONG_NORMAL, aim, tolerance=rough) and self.plate.force_n[0] < most_n:
                 self._log("moved")
                 self.on_converged()
@@ -177,10 +183,11 @@ class LoadPath:
     def _to_force(self, force_n: float) -> float:
         """Step of the approach to a force, mm, if the force goes on to grow by the same factor with each mm."""
         before, now = self.curve[-2:] if len(self.curve) > 1 else 2 * self.curve
-        if not force_n > now.force_n[0] > before.force_n[0] > 0.0:
+        moved_mm = now.displacement_mm[0] - before.displacement_mm[0]
+        if not (force_n > now.force_n[0] > before.force_n[0] > 0.0 and moved_mm > _LEAST_APPROACH_MM):
             return np.inf
         rates = np.log([now.force_n[0] / before.force_n[0], force_n / now.force_n[0]])
-        return float((now.displacement_mm[0] - before.displacement_mm[0]) * rates[1] / rates[0])
+        return float(moved_mm * rates[1] / rates[0])
 
     def _to_next_stop(self) -> float:
         """Step of the approach, mm; its stops are the same wherever it is resumed, and so are the nodes that touch."""
@@ -317,16 +324,16 @@ class Loading:
             path.curve = list(earlier.curve)
             path.resume((earlier.unknowns, earlier.curve[-1], earlier.contact))
             self._stages, self._counted = earlier.stages, path.iterations - earlier.iterations
+        if before is None:  # from the first touch, whatever it passes
+            self._before = np.where(target.displaced, path.curve[0].displacement_mm, path.curve[0].force_n)
         path.on_converged = lambda: on_converged(self.checkpoint(), float(np.clip(self._shares(), 0.0, 1.0).mean()))
 
     def run(self) -> bool:
         """Load up to the target, normal first, then shear; whether it is reached."""
         path, target = self._path, self._target
         stages = [partial(path.raise_to, target)]
-        if self._first:  # the approach comes near to the normal force, unless the plate rotates
-            near = not (path.contact.plate.turns or target.displaced[0])
-            pressed = partial(path.raise_to, target.unsheared(), 1.0 if near else _FIRST_STEP)
-            stages = [partial(path.approach, target), pressed, *(stages if target.sheared else [])]
+        if self._first:
+            stages = [partial(path.approach, target), partial(path.press, target), *(stages if target.sheared else [])]
         for stage in stages[self._stages :]:
             if not stage():
                 return False

@@ -18,7 +18,7 @@ _MOST_GROWTH = 3.0  # of the residual in one step
 # second the search stops.
 _WANDERED, _LOST = 2, 12
 BALANCED, SMALL_MM = 5, 0.1  # also converged: so many consecutive steps within the force tolerance, the last this small
-_LINGERED, _CLOSE = 8, 10.0  # or so many within so many times the tolerance
+_LINGERED, _CLOSE, _CLOSEST = 8, 10.0, 1e-3  # or so many within so many times the tolerance, at most this fraction
 _SHARES = (1.0, 0.5, 0.25)
 _ROUGH, _INEXACT = 0.05, 1e-3  # tolerance of the linear solver, far from equilibrium and near it
 
@@ -105,10 +105,10 @@ def equilibrium(
             now, balanced, close = newton.at(now.state), 0, 0
             continue
         balanced = balanced + 1 if balance <= tolerance.force else 0
-        close = close + 1 if balance <= _CLOSE * tolerance.force else 0
+        close = close + 1 if balance <= max(tolerance.force, min(_CLOSE * tolerance.force, _CLOSEST)) else 0
         if balanced and share == 1.0 and largest <= tolerance.step_mm:
             return Converged(now.state, now.forces, iteration)
-        if (balanced >= BALANCED or close >= _LINGERED) and largest <= SMALL_MM:
+        if (balanced >= BALANCED or close >= _LINGERED) and largest <= share * SMALL_MM:
             within = f"{balanced} consecutive steps within" if balanced >= BALANCED else f"{close} within ten times"
             log(f"    accepted: {within} the force tolerance, the last of {largest:.1e} mm")
             return Converged(now.state, now.forces, iteration)

@@ -232,12 +232,16 @@ def _passed(first: LoadStep, loads: Sequence[LoadStep], plate_of: Mapping[str, P
 
     def pressed(load: LoadStep) -> tuple[Hashable, ...]:
         plate = plate_of[load.name]
-        return bool(load.target.displaced[0]), tuple(plate.axes.ravel()), plate.gap_mm, plate.taped, plate.turns
+        pivot = None if plate.pivot_mm is None else tuple(np.asarray(plate.pivot_mm, dtype=np.float64))
+        return bool(load.target.displaced[0]), tuple(plate.axes.ravel()), plate.gap_mm, plate.taped, plate.turns, pivot
 
     if plate_of[first.name].turns:
         return ()
     like = [load for load in loads if not load.sheared and pressed(load) == pressed(first)]
-    smaller = {float(load.target.values[0]): load for load in like if load.target.values[0] < first.target.values[0]}
+    smaller: dict[float, LoadStep] = {}
+    for load in like:
+        if load.target.values[0] < first.target.values[0]:
+            smaller.setdefault(float(load.target.values[0]), load)
     return tuple(smaller[value] for value in sorted(smaller))
 
 

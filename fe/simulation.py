@@ -44,7 +44,8 @@ class Simulation:
     paths : tuple of tuple of LoadStep
         The requested loads, each path in the order of simulation.
     states : tuple of LoadState
-        Results in that order. On an incomplete path, the last one has ``reached`` below 1.
+        Results in that order. On an incomplete path, the last one has ``reached`` below 1; the path has none if a load
+        that it passes was not reached.
     fixed : tuple of str
         Fixed surface sets.
     element : str
@@ -137,7 +138,7 @@ class Simulation:
             if state.reached < 1.0 and not state.out_of_time
         ]
         notes += [
-            f"{load.name} was not tried: the previous load was not reached."
+            f"{load.name} was not tried: the load before it was not reached."
             for load in self.loads
             if load.name not in reached
         ]
@@ -399,7 +400,7 @@ def simulate(
     known: dict[str, LoadState] = {}
     for one in sorted(problems, key=lambda problem: len(problem.passed)):
         if all(load.name in known and known[load.name].reached == 1.0 for load in one.passed):
-            earlier = [at for load in one.passed if (at := known[load.name].checkpoint)]
+            earlier = {load.name: at for load in one.passed if (at := known[load.name].checkpoint)}
             known |= {state.load.name: state for state in solve(one, options, observer, earlier)}
     names = [load.name for one in problems for load in one.loads]
     return Simulation.of(chosen, problems, [known[name] for name in names if name in known])

@@ -1,8 +1,9 @@
 """Solution of a problem: the loads of one path in sequence, and the final state of each load."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -116,7 +117,7 @@ class LoadState:
 @checked
 def solve(
     problem: Problem, options: SolverOptions | None = None, observer: Observer | None = None,
-    earlier: Sequence[Checkpoint] = (),
+    earlier: Mapping[str, Checkpoint] = MappingProxyType({}),
 ) -> list[LoadState]:  # fmt: skip
     """Press and shear soft tissue with a rigid plate, along one load path.
 
@@ -124,9 +125,9 @@ def solve(
     ----------
     options, observer : optional
         Threads, time limit and tolerance; and the observer that receives the progress.
-    earlier : sequence of Checkpoint
-        Checkpoints of the first loads, those that are passed included, from an earlier solution of the same problem.
-        These loads are not solved again; the last one may be incomplete and is continued.
+    earlier : mapping of load name to Checkpoint
+        From an earlier solution of the same problem: of the first loads, or of those that are passed. A complete load
+        is not solved again, an incomplete one is continued.
 
     Returns
     -------
@@ -135,7 +136,10 @@ def solve(
         its last converged increment and ``reached`` below 1. It is empty if a load that is passed cannot be reached.
     """
     options, observer = options or SolverOptions(), observer or Observer()
-    mesh, loads, axes = problem.mesh, (*problem.passed, *problem.loads), problem.plate.axes
+    mesh, axes = problem.mesh, problem.plate.axes
+    passed = () if problem.loads[0].name in earlier else tuple(problem.passed)
+    passed = passed[max((n for n, load in enumerate(passed) if load.name in earlier), default=0) :]
+    loads = (*passed, *problem.loads)
     turned = TetMesh(mesh.points_mm @ axes, mesh.cells, mesh.regions, mesh.facets)
     model = Model.of(turned, problem.materials, element(problem.element))
     deadline = time.monotonic() + options.limit_s
@@ -147,7 +151,7 @@ def solve(
     before: Checkpoint | None = None
     try:
         for number, load in enumerate(loads):
-            own = number >= len(problem.passed)
+            own = number >= len(passed)
 
             def on_converged(
                 checkpoint: Checkpoint, done: float, number: int = number, load: LoadStep = load, own: bool = own
@@ -156,7 +160,7 @@ def solve(
                 if own:
                     observer.converged(load, checkpoint)
 
-            known = dict(enumerate(earlier)).get(number)
+            known = earlier.get(load.name)
             if before is not None and not states and known is None:  # the load that it passes is an increment of it
                 known = replace(before, stages=0)
             loading = Loading(path, load.target, states[-1].load.target if states else None, known, on_converged)

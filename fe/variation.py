@@ -96,7 +96,7 @@ def from_base(
             continue
         last = 2 if load.sheared else 1  # the approach and the normal force are done; the last stage is done again
         start = replace(state, reached=0.0, stages=last, iterations=0, seconds=0.0)
-        states += solve(replace(problem, loads=(load,), passed=()), options, observer, (start,))
+        states += solve(replace(problem, loads=(load,), passed=()), options, observer, {load.name: start})
     return states
 
 

@@ -177,7 +177,7 @@ def _solved(held: Holdings) -> str:
     short = ", ".join(f"{model} {load} {part:.0%}" for model, load, part in loads if part < 1.0)
     reached = f"reached in part: {short}" if short else f"all {len(loads)} loads reached"
     force = f"{100.0 * Tolerance().force:g} % of those on the plate and the fixed nodes"
-    return f"Residual forces at each converged increment: at most {force}; {reached}"
+    return f"Residual forces at the end of a load: at most {force}, or ten times that where steps linger; {reached}"
 
 
 def _uncertainties(held: Holdings) -> str:

@@ -73,7 +73,7 @@ def simulate(
         ``regions.csv``, ``simulation.json`` and figures.
     loads : sequence of LoadStep
         Loads with the same normal force are simulated as one load path, in the order of their shear; by default those
-        of the published experiment.
+        of the published experiment. The first load of a path passes smaller loads without shear.
     towards : mapping, optional
         ``plate_normal`` and ``shear_direction``, by name, of loads that have their own directions.
     simulation, plate_options, coordinates, cores
@@ -124,7 +124,8 @@ def simulate(
             make_output(folder)
             held_folders.enter_context(alone(folder))
             _remove_earlier(folder, plates)
-        in_order = sorted(jobs, key=lambda job: len(job[1].passed))  # what others pass comes first
+        # What others pass comes first; on one core, one set after the other.
+        in_order = sorted(jobs, key=lambda job: (at_once == 1 and chosen.index(job[0]), len(job[1].passed)))
         each_in_workers(in_order, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
         kind = WorkerError if run.died == run.failures.keys() else MrstrainError
@@ -189,6 +190,7 @@ class _Run:
     done: dict[str, fe.Simulation] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
     died: set[str] = field(default_factory=set)  # those of them whose process died
+    crashed: set[int] = field(default_factory=set)  # problems whose solution failed, by their id
     ended: dict[int, list[fe.LoadState]] = field(default_factory=dict)
     writing: threading.Lock = field(default_factory=threading.Lock)
 
@@ -208,6 +210,7 @@ class _Run:
                     states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
             except MrstrainError as failure:
                 self.failures[case] = str(failure)
+                self.crashed.add(id(problem))
                 self.died.update({case} if isinstance(failure, WorkerError) else ())
         with self.writing:
             self.ended[id(problem)] = states
@@ -217,8 +220,9 @@ class _Run:
         self.progress(case, "simulating", 1.0)
 
     def _passed_in_vain(self, chosen: fe.MaterialSet, problem: fe.Problem) -> bool:
-        """Whether another path has ended without a load that this one passes."""
-        others = [(one, self.ended[id(one)]) for of, one in self.jobs if of is chosen and id(one) in self.ended]
+        """Whether another path has ended without equilibrium under a load that this one passes."""
+        whole = self.ended.keys() - self.crashed
+        others = [(one, self.ended[id(one)]) for of, one in self.jobs if of is chosen and id(one) in whole]
         lost = {load for one, _ in others for load in one.loads} - {
             state.load for _, states in others for state in states if state.reached == 1.0
         }
@@ -267,18 +271,25 @@ class _Files(fe.Observer):
         self._last = time.monotonic()
         write_whole(self._log, "")
 
-    def earlier(self) -> list[fe.Checkpoint]:
-        """Checkpoints of the first loads from an earlier run or path; the last own load may be incomplete."""
-        kept: list[fe.Checkpoint] = []
-        for load in (*self._problem.passed, *self._problem.loads):
-            checkpoint = read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
-            if checkpoint is None or (kept and kept[-1].reached < 1.0):
+    def earlier(self) -> dict[str, fe.Checkpoint]:
+        """Checkpoints of the first loads, the last of which may be incomplete, and of complete ones that are passed."""
+        kept: dict[str, fe.Checkpoint] = {}
+        for load in self._problem.loads:
+            checkpoint = self._read(load)
+            if checkpoint is None:
                 break
-            if load in self._problem.passed and checkpoint.reached < 1.0:  # another path may be solving it now
+            kept[load.name] = checkpoint
+            if checkpoint.reached < 1.0:
                 break
-            self.log(f"{load.name}: resumed at {checkpoint.reached:.0%} from an earlier run")
-            kept.append(checkpoint)
+        if not kept:  # another path may be solving an incomplete one now
+            read = {load.name: self._read(load) for load in self._problem.passed}
+            kept = {name: at for name, at in read.items() if at is not None and at.reached == 1.0}
+        for name, checkpoint in kept.items():
+            self.log(f"{name}: resumed at {checkpoint.reached:.0%}, as solved before")
         return kept
+
+    def _read(self, load: fe.LoadStep) -> fe.Checkpoint | None:
+        return read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
 
     def log(self, line: str) -> None:
         try:

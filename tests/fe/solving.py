@@ -1,6 +1,7 @@
 """One path of loads solved, with everything that may be said of it as a keyword."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -40,7 +41,7 @@ class Notebook(Observer):
 def solved(
     mesh: TetMesh, materials: Mapping[str, Material], plate: Plate, loads: Sequence[LoadStep], *,
     fixed: Sequence[str] = ("bone",), element: str = "P1", threads: int = 1, tolerance: Tolerance | None = None,
-    limit_s: float = np.inf, earlier: Sequence[Checkpoint] = (), observer: Observer | None = None,
+    limit_s: float = np.inf, earlier: Mapping[str, Checkpoint] = MappingProxyType({}), observer: Observer | None = None,
 ) -> list[LoadState]:  # fmt: skip
     """The states in which these loads end, each reached from the one before it."""
     problem = Problem(mesh, materials, plate, loads, fixed, element)

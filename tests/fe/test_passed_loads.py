@@ -1,5 +1,6 @@
 """Loads that a larger one passes: which they are, that they are solved once, and what becomes of it if they fail."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 import fe
 import mrstrain
 from fe import LoadStep, Plate, Problem, problems_of
-from mrstrain.models.simulate import LOADS as PUBLISHED
+from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
+from mrstrain.models.simulate import LOADS as PUBLISHED, solve_in_folder
 from tests.fe.solving import Notebook
 from tests.fe.test_simulate import ALONG, DOWN, FAT, LAWS, dome
 
@@ -33,7 +35,10 @@ def test_a_load_passes_only_loads_of_an_equal_plate() -> None:
     assert passed([LARGE, SMALL, LoadStep("in", normal_mm=1.5)]) == {"large": ["small"], "small": [], "in": []}
     assert passed([SMALL, LARGE], Plate(DOWN, ALONG, turns=True)) == {"small": [], "large": []}
     tilted = Plate([-1.0, 0.1, 0.0], ALONG)
-    assert passed([SMALL, LARGE], {"small": PLATE, "large": tilted}) == {"small": [], "large": []}
+    aside = Plate(DOWN, ALONG, pivot_mm=[0.0, 5.0, 5.0])
+    for other in (tilted, aside):
+        assert passed([SMALL, LARGE], {"small": PLATE, "large": other}) == {"small": [], "large": []}
+    assert passed([SMALL, LoadStep("twin", 1.0), LARGE])["large"] == ["small"]  # the first of its path
 
 
 def test_passed_loads_are_solved_once_with_the_same_bits() -> None:
@@ -73,27 +78,53 @@ def test_what_passes_a_load_that_is_not_reached_is_not_tried(monkeypatch: pytest
     done = fe.simulate(dome((3, 4, 4)), weak, PLATE, [LoadStep("most", 4000.0), LoadStep("much", 3000.0)])
     assert solved == ["much"]
     assert [state.load.name for state in done.states] == ["much"]
-    assert "most was not tried: the previous load was not reached." in done.notes
+    assert "most was not tried: the load before it was not reached." in done.notes
+
+
+def test_the_fraction_reached_is_that_of_the_whole_load() -> None:
+    mesh, ticks = dome((3, 5, 5)), Notebook()
+    problem = problems_of(mesh, LAWS, PLATE, [LARGE, SMALL])[0]
+    (small,) = fe.solve(Problem(mesh, LAWS, PLATE, [SMALL]))
+    (whole,) = fe.solve(problem, observer=ticks, earlier={"small": small.checkpoint})
+    shares = [(at.reached, at.curve[-1].force_n[0] / LARGE.normal_n) for _, at in ticks.increments]
+    assert len(shares) > 2
+    assert all(reached == pytest.approx(force, abs=1e-3) for reached, force in shares)
+    middle = ticks.increments[1][1]
+    (again,) = fe.solve(problem, earlier={"large": middle})  # its own checkpoint is enough
+    assert np.abs(again.u_mm - whole.u_mm).max() < 1e-3 * np.abs(whole.u_mm).max()
+
+
+def test_an_incomplete_or_missing_file_of_a_passed_load_is_not_used(tmp_path: Path) -> None:
+    mesh = dome((3, 5, 5))
+    small, large = sorted(problems_of(mesh, LAWS, PLATE, [LARGE, SMALL]), key=lambda one: len(one.passed))
+    states, share = [], tmp_path / "share"
+    for name in ("alone", "shared", "begun"):
+        (folder := tmp_path / name).mkdir()
+        if name != "alone":
+            solve_in_folder(small, fe.SolverOptions(), folder, share)
+        if name == "begun":
+            file, made_from = folder / f"small{ENDING}", fingerprint(small, SMALL)
+            write_checkpoint(file, replace(read_checkpoint(file, made_from), reached=0.5), made_from)
+        states += solve_in_folder(large, fe.SolverOptions(), folder, share)
+        assert (folder / "log-large.txt").read_text().startswith("small: resumed") == (name == "shared")
+    assert [state.load.name for state in states] == ["large"] * 3
+    assert np.array_equal(states[0].u_mm, states[1].u_mm)
+    assert np.array_equal(states[0].u_mm, states[2].u_mm)
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_the_command_solves_them_once_on_one_core_and_gives_the_same_on_two(tmp_path: Path) -> None:
+def test_the_command_solves_them_once_on_one_core(tmp_path: Path) -> None:
     fe.write_tet_mesh(tmp_path / "dome.vtu", dome((3, 5, 5)), {})
-    states = []
-    for workers in (1, 2):
-        out = tmp_path / f"on {workers}"
-        made = mrstrain.simulate(
-            tmp_path / "dome.vtu", sets=["trebbi"], loads=[LARGE, SMALL, SHEARED], plate_normal=DOWN,
-            shear_direction=ALONG, out=out, workers=workers, threads=1,
-        )  # fmt: skip
-        states.append(made.sets[0].state("large").u_mm)
-        log = (out / "trebbi" / "log-large.txt").read_text()
-        assert workers == 2 or log.startswith("small: resumed at 100%")
-    assert np.array_equal(*states)
+    made = mrstrain.simulate(
+        tmp_path / "dome.vtu", sets=["trebbi"], loads=[LARGE, SMALL, SHEARED], plate_normal=DOWN,
+        shear_direction=ALONG, out=tmp_path / "out", workers=1, threads=1,
+    )  # fmt: skip
+    assert [state.load.name for state in made.sets[0].states] == ["large", "small", "sheared"]
+    assert (tmp_path / "out" / "trebbi" / "log-large.txt").read_text().startswith("small: resumed at 100%")
 
 
 def test_nodes_touch_in_the_order_of_small_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Force-controlled steps by a quarter of the load put nodes on the tape that small steps do not."""
+    """A step of the force from a fifth of the load puts nodes on the tape that small steps do not."""
     loads, soft = [LoadStep("small", 0.8)], {"skin": FAT, "fat": FAT}
     mesh = dome((4, 12, 12))
 

@@ -45,7 +45,7 @@ def whole() -> tuple[list[LoadState], list[str], list[tuple[str, Checkpoint]]]:
 def test_going_on_from_a_load_ends_where_an_uncut_run_ends(whole, tmp_path: Path) -> None:
     states, told, _ = whole
     write_checkpoint(tmp_path / "a.npz", states[0].checkpoint, "this")
-    again, lines, _ = run(earlier=[read_checkpoint(tmp_path / "a.npz", "this")])
+    again, lines, _ = run(earlier={"a": read_checkpoint(tmp_path / "a.npz", "this")})
     for state, other in zip(states, again, strict=True):  # bit for bit
         for array in ("u_mm", "pressure_mpa", "gradients", "on_plate"):
             assert np.array_equal(getattr(other, array), getattr(state, array)), array
@@ -64,7 +64,7 @@ def test_going_on_from_the_middle_of_a_load(whole, load: str, share: float) -> N
     on_way = [kept for name, kept in way if name == load and kept.reached < 1.0]
     kept = on_way[int(share * len(on_way))]
     assert 0.0 < kept.reached < 1.0
-    again, lines, _ = run(earlier=[kept] if load == "a" else [states[0].checkpoint, kept])
+    again, lines, _ = run(earlier={"a": kept} if load == "a" else {"a": states[0].checkpoint, "b": kept})
     assert share == 0.0 or len(lines) < len(told)
     for state, other in zip(states, again, strict=True):
         assert other.reached == 1.0
@@ -85,7 +85,7 @@ def test_a_path_whose_time_is_over_ends_where_it_stands_and_goes_on(
     assert 0.0 < cut[0].reached < 1.0
     assert cut[0].force_n[0] == pytest.approx(2.0 * cut[0].reached, rel=0.01)
     write_checkpoint(tmp_path / "a.npz", cut[0].checkpoint, "this")
-    on, _, _ = run(earlier=[read_checkpoint(tmp_path / "a.npz", "this")])
+    on, _, _ = run(earlier={"a": read_checkpoint(tmp_path / "a.npz", "this")})
     for state, other in zip(whole[0], on, strict=True):
         assert (other.reached, other.out_of_time, state.out_of_time) == (1.0, False, False)
         assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
@@ -107,7 +107,7 @@ def test_a_path_cut_while_the_plate_approaches_ends_where_an_uncut_one_does(
         cut = going(limit_s=steps)
     assert cut.out_of_time
     assert 0.0 <= cut.reached < 1.0
-    on = going(earlier=[cut.checkpoint])
+    on = going(earlier={"a": cut.checkpoint})
     assert on.plate_displacement_mm[0] == pytest.approx(whole.plate_displacement_mm[0], abs=2e-3)
     assert np.abs(on.u_mm - whole.u_mm).max() < 0.01 * np.abs(whole.u_mm).max()
 
@@ -205,7 +205,7 @@ def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
     again = CliRunner().invoke(app, [*command, "--out", str(out.parent)])
     assert again.exit_code == 0, again.output
     log = (out / "log-a.txt").read_text().splitlines()
-    assert log[0] == "a: resumed at 100% from an earlier run"
+    assert log[0] == "a: resumed at 100%, as solved before"
     assert not any(line.startswith("moved") for line in log)
     for load in ("a", "b", "c"):
         one, other = (meshio.read(folder / "luboz" / f"{load}.vtu") for folder in (tmp_path / "uncut", out.parent))
