@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from dvc import Deformation
 from dvc.arrays import FloatArray
-from dvc.report.chart import chart, label_axes, legend, panels, shared_bar
+from dvc.report.chart import chart, label_axes, legend, legend_above, panels, shared_bar
 from dvc.report.drawing import Columns
 from dvc.report.style import BAND, INK, WIDTH_IN, Look, looks
 from fe import published_names
@@ -66,7 +66,7 @@ def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], mode
             axes.axvline(edge, color=INK, linewidth=1.1, linestyle=":")
         axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
         label_axes(axes, _MAX_SHEAR, "volume above this strain, mL", title)
-    legend(spots[0])
+    legend_above(spots[0])
     return figure
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from dvc.report.chart import label_axes, legend, panels
+from dvc.report.chart import label_axes, legend_above, panels
 from dvc.report.drawing import Columns, Drawing
 from dvc.report.page import Cell, Picture, Section, Table
 from dvc.report.style import BAND, INK
@@ -48,7 +48,7 @@ def coefficients(decompositions: Mapping[str, Decomposition], models: Sequence[s
             axes.plot(by.estimate, values, **look[name].marked | {"linestyle": "none", "markersize": 3, "label": name})
         axes.set(xlim=line, ylim=line)
         label_axes(axes, "measured coefficient, no unit", "simulated coefficient, no unit", tissue)
-    legend(spots[0])
+    legend_above(spots[0])
     return figure
 
 

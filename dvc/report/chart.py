@@ -60,9 +60,20 @@ def legend(axes: Axes, *, loc: Any = "best", **where: Any) -> None:
     With a place that is asked for, if only "best", matplotlib does not warn where a busy machine takes a second for it.
     """
     if axes.get_legend_handles_labels()[0]:
-        font = FontProperties(family=FAMILY, size=SMALL_PT)
         ground = {"facecolor": "white", "edgecolor": "none", "framealpha": 0.9}
-        axes.legend(prop=font, labelcolor=INK, loc=loc, **ground, **where)
+        axes.legend(prop=_legend_font(), labelcolor=INK, loc=loc, **ground, **where)
+
+
+def legend_above(axes: Axes, columns: int = 4) -> None:
+    """Put the legend of a panel above all panels of its figure, where it hides no line."""
+    handles, labels = axes.get_legend_handles_labels()
+    _figure_of(axes).legend(
+        handles, labels, loc="outside upper center", ncols=columns, frameon=False, prop=_legend_font(), labelcolor=INK
+    )
+
+
+def _legend_font() -> FontProperties:
+    return FontProperties(family=FAMILY, size=SMALL_PT)
 
 
 def colour_bar(axes: Axes, mapped: ScalarMappable, label: str, extend: str = "neither") -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvc.report.chart import chart, legend
+from dvc.report.chart import chart, legend, legend_above, panels
 
 
 def test_no_line_runs_through_the_text_of_a_legend() -> None:
@@ -20,3 +20,15 @@ def test_no_line_runs_through_the_text_of_a_legend() -> None:
     beside = grey[int(box.y1) + 10 : int(box.y1) + 30, int(box.x0) : int(box.x1)]
     assert beside.min() < 100.0
     assert beneath.min() > 200.0
+
+
+def test_a_legend_above_panels_hides_none_of_them() -> None:
+    figure, spots = panels(4)
+    for number in range(7):
+        spots[0].plot([0.0, 1.0], [0.0, 1.0], label=f"model number {number}")
+    legend_above(spots[0])
+    figure.canvas.draw()
+    (box,) = (one.get_window_extent() for one in figure.legends)
+    assert all(box.y0 >= spot.get_tightbbox().y1 for spot in spots)  # type: ignore[union-attr]
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
