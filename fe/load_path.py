@@ -285,7 +285,8 @@ class Checkpoint:
     curve : tuple of PlateState
         State of the plate at every converged increment, from that of the previous load to this one.
     iterations : int
-        Newton iterations since the previous load, without those of failed increments.
+        Newton iterations since the previous load, without those of failed increments; those of loads that are passed
+        count, as they do in ``curve`` and ``seconds``.
     unknowns : (unknowns,)
         Displacements, along the plate's axes, and pressures.
     """

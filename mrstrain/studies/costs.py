@@ -25,7 +25,7 @@ CARE = "WARNING"
 _REGISTER_S, _MAPS_S_PER_MVOXEL = 13.0, 3.5  # in addition to the engine (`Cost`)
 _TWIN = 1.3  # additional time, relative: the synthetic warp is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 16.0, 1.5
-# The seven published sets took .5 to 2.6 times as long as this says, whose softest tissues have .3 to 390 kPa.
+# Six published sets took .5 to 3.4 times as long as this says, whose softest tissues have .3 to 390 kPa.
 _SOFT_MPA, _SOFTER = 0.01, 0.4
 # Of P1's time and memory: P2 20 times as long on 60,000 cells of the heel, MINI a third of P2's time on 56,000, where
 # P2 took 2.2 GiB, MINI .84.

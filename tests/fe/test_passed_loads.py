@@ -8,6 +8,7 @@ import pytest
 
 import fe
 import mrstrain
+from dvc.errors import WorkerError
 from fe import LoadStep, Plate, Problem, problems_of
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.models.simulate import LOADS as PUBLISHED, solve_in_folder
@@ -142,3 +143,24 @@ def test_nodes_touch_in_the_order_of_small_steps(monkeypatch: pytest.MonkeyPatch
         coarse.setattr("fe.load_path._ENOUGH", (0.2,))
         large = nodes()
     assert len(plain ^ small) < 0.5 * len(large ^ small)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_crash_after_a_passed_load_does_not_cost_the_larger_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def crashing(problem: Problem, *given):
+        states = solve_in_folder(problem, *given)
+        if problem.loads[0].name == "small":
+            raise WorkerError("The process was killed.")
+        return states
+
+    monkeypatch.setattr("mrstrain.models.simulate.solve_in_folder", crashing)
+    fe.write_tet_mesh(tmp_path / "dome.vtu", dome((3, 5, 5)), {})
+    made = mrstrain.simulate(
+        tmp_path / "dome.vtu", sets=["trebbi"], loads=[LARGE, SMALL, SHEARED], plate_normal=DOWN,
+        shear_direction=ALONG, out=tmp_path / "out", workers=1, threads=1,
+    )  # fmt: skip
+    assert [state.load.name for state in made.sets[0].states] == ["large"]
+    assert list(made.failures) == ["trebbi, small sheared"]
+    assert not made.complete
