@@ -26,7 +26,7 @@ def test_commands_that_the_page_names_are_there() -> None:
 
 def test_every_claim_names_what_shows_it() -> None:
     """A claim is a row of a table or a point of a list, but for what is not tried."""
-    claims, _, untried = PAGE.partition("## What is not tried")
+    claims, _, untried = PAGE.partition("## Not tested")
     assert untried
     rows = [
         row for row in re.findall(r"^\|.*\|$", claims, re.MULTILINE) if not re.match(r"\|(-|.*\| what happens \|)", row)
