@@ -13,6 +13,8 @@ from matplotlib.font_manager import FontProperties
 
 from dvc.report.style import DPI, FAMILY, FONT, GRID, INK, SMALL_PT, WIDTH_IN
 
+_ONE_ROW = 5  # entries of a legend, at most
+
 
 def chart(panels: int = 1, page_wide: bool = False) -> tuple[Figure, tuple[Axes, ...]]:
     """An empty figure with so many axes side by side, for curves; each a part of the page's width, or all that wide."""
@@ -64,9 +66,10 @@ def legend(axes: Axes, *, loc: Any = "best", **where: Any) -> None:
         axes.legend(prop=_legend_font(), labelcolor=INK, loc=loc, **ground, **where)
 
 
-def legend_above(axes: Axes, columns: int = 4) -> None:
-    """Put the legend of a panel above all panels of its figure, where it hides no line."""
+def legend_above(axes: Axes) -> None:
+    """Put the legend of a panel above all panels of its figure, where it hides no line; in one row if it is short."""
     handles, labels = axes.get_legend_handles_labels()
+    columns = len(labels) if len(labels) <= _ONE_ROW else _ONE_ROW - 1
     _figure_of(axes).legend(
         handles, labels, loc="outside upper center", ncols=columns, frameon=False, prop=_legend_font(), labelcolor=INK
     )
