@@ -29,7 +29,7 @@ _LEAST_APPROACH_MM = 0.01
 _ALONG_NORMAL = np.array([True, False, False])
 # Fraction of the normal load up to which the plate is displacement controlled, so that nodes touch it in order. A plate
 # that rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
-_ENOUGH, _RELEASED = (0.8,), (0.2, 0.4, 0.6, 0.8)
+_ENOUGH, _RELEASED = 0.8, (0.2, 0.4, 0.6, 0.8)
 _AIM = 0.9  # of the normal load, for the last step on the way there
 _ROUGH_FORCE, _ROUGH_STEP = 10.0, 30.0  # factors on the tolerance of increments on the way there
 
@@ -101,7 +101,7 @@ class LoadPath:
         """Make contact, press to a fraction of the normal load, and release a rotating plate; whether to continue."""
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
-        for share in _RELEASED if self.contact.plate.turns else _ENOUGH:
+        for share in _RELEASED if self.contact.plate.turns else (_ENOUGH,):
             if target.displaced[0]:
                 way = target.values - self._start_mm
                 part = PlateTarget(self._start_mm + share * way, target.displaced).unsheared()
@@ -137,7 +137,7 @@ class LoadPath:
     def press(self, target: PlateTarget) -> bool:
         """Continue to the normal load, in one step if the approach has come near; whether it is reached."""
         free = self.contact.plate.turns or target.displaced[0]
-        near = not free and self.plate.force_n[0] >= _ENOUGH[0] * target.values[0]
+        near = not free and self.plate.force_n[0] >= _ENOUGH * target.values[0]
         return self.raise_to(target.unsheared(), 1.0 if near else _FIRST_STEP)
 
     def raise_to(self, target: PlateTarget, first: float = _FIRST_STEP) -> bool:

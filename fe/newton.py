@@ -33,8 +33,8 @@ class Tolerance:
         Largest norm of the residual forces, as a fraction of the forces on the plate and the fixed nodes.
     step_mm : float
         Largest change of a displacement in the last step, mm. Five consecutive steps within ``force``, or eight within
-        ten times it, the last below 0.1 mm, are also accepted, because the nodes of a nearly flat cell may move almost
-        without force.
+        ten times it (at most .1 %), the last below 0.1 mm, are also accepted, because the nodes of a nearly flat cell
+        may move almost without force.
     iterations : int
         Largest number of iterations.
     """

@@ -22,7 +22,7 @@ from fe.problem import LoadStep, Problem, problems_of
 from fe.published import MaterialSet, as_material_set
 from fe.result import RegionFigures
 from fe.simulation_files import RECORD, read_parts
-from fe.solution import LoadState, Observer, SolverOptions, solve
+from fe.solution import LoadState, Observer, SolverOptions, solve_paths
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -397,10 +397,4 @@ def simulate(
     problems = problems_of(mesh, by_region, plate, loads, fixed, element)
     for note in (*notes, *(note for one in problems for note in one.notes)):
         observer.log(note)
-    known: dict[str, LoadState] = {}
-    for one in sorted(problems, key=lambda problem: len(problem.passed)):
-        if all(load.name in known and known[load.name].reached == 1.0 for load in one.passed):
-            earlier = {load.name: at for load in one.passed if (at := known[load.name].checkpoint)}
-            known |= {state.load.name: state for state in solve(one, options, observer, earlier)}
-    names = [load.name for one in problems for load in one.loads]
-    return Simulation.of(chosen, problems, [known[name] for name in names if name in known])
+    return Simulation.of(chosen, problems, solve_paths(problems, options, observer))

@@ -1,7 +1,7 @@
 """Solution of a problem: the loads of one path in sequence, and the final state of each load."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -182,3 +182,19 @@ def solve(
     finally:
         path.solver.close()
     return states
+
+
+def solve_paths(
+    problems: Sequence[Problem], options: SolverOptions | None = None, observer: Observer | None = None
+) -> list[LoadState]:
+    """Solve all load paths of `fe.problems_of`, in their order; a load that several of them pass is solved once.
+
+    A path is not tried if a load that it passes is not reached.
+    """
+    known: dict[str, LoadState] = {}
+    for one in sorted(problems, key=lambda problem: len(problem.passed)):
+        if all(load.name in known and known[load.name].reached == 1.0 for load in one.passed):
+            earlier = {load.name: at for load in one.passed if (at := known[load.name].checkpoint)}
+            known |= {state.load.name: state for state in solve(one, options, observer, earlier)}
+    names = [load.name for one in problems for load in one.loads]
+    return [known[name] for name in names if name in known]

@@ -68,13 +68,13 @@ def test_a_load_that_passes_another_is_that_load_from_its_start() -> None:
 
 def test_what_passes_a_load_that_is_not_reached_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     solved: list[str] = []
-    solve = fe.simulation.solve
+    solve = fe.solution.solve
 
     def counted(problem: Problem, *given):
         solved.append(problem.loads[0].name)
         return solve(problem, *given)
 
-    monkeypatch.setattr("fe.simulation.solve", counted)
+    monkeypatch.setattr("fe.solution.solve", counted)
     weak = {"skin": fe.NeoHooke.of(0.067, nu=0.495), "fat": fe.NeoHooke.of(0.01, nu=0.49)}
     done = fe.simulate(dome((3, 4, 4)), weak, PLATE, [LoadStep("most", 4000.0), LoadStep("much", 3000.0)])
     assert solved == ["much"]
@@ -136,11 +136,11 @@ def test_nodes_touch_in_the_order_of_small_steps(monkeypatch: pytest.MonkeyPatch
     with monkeypatch.context() as fine:
         fine.setattr("fe.load_path._MOST_APPROACH_MM", 0.05)
         fine.setattr("fe.load_path._APPROACH_MM", 0.05)
-        fine.setattr("fe.load_path._ENOUGH", (0.98,))
+        fine.setattr("fe.load_path._ENOUGH", 0.98)
         fine.setattr("fe.load_path._AIM", 0.99)
         small = nodes()
     with monkeypatch.context() as coarse:
-        coarse.setattr("fe.load_path._ENOUGH", (0.2,))
+        coarse.setattr("fe.load_path._ENOUGH", 0.2)
         large = nodes()
     assert len(plain ^ small) < 0.5 * len(large ^ small)
 
