@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -59,6 +60,7 @@ def test_larger_images_and_meshes_take_longer_and_more_memory(study):
 
 
 def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**12, 0, 10**12))
     (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = false"))
     told = read_study(study)
     load = next(stage for stage in plan(told) if stage.kind == "register")
