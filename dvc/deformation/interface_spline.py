@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, spline_filter
+from scipy.ndimage import distance_transform_edt
 
 from dvc import threads
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
@@ -18,6 +18,7 @@ from dvc.deformation.bspline import ALIGNED_INDEX, BSpline, evaluate_spline, ind
 from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
 from dvc.images.depth import NUMBERS as OF_DEPTH, depth_mm
+from dvc.images.filters import spline_coefficients
 from dvc.images.image import Grid, LabelMap, Mask
 from dvc.images.interpolation import indices_around, spline_basis
 from dvc.threads import in_parts
@@ -77,7 +78,7 @@ class Interfaces:
         """Interfaces between tissues that are numbered from 0 on; parameters as the attributes."""
 
         def coefficients(number: int) -> FloatArray:
-            return np.asarray(spline_filter(depth_mm(own == number, grid.spacing_mm), order=3, mode="mirror"))
+            return np.asarray(spline_coefficients(depth_mm(own == number, grid.spacing_mm), np.float64))
 
         with ThreadPoolExecutor(threads.count()) as pool:
             depth = np.stack(list(pool.map(coefficients, range(int(own.max()) + 1))))

@@ -10,10 +10,11 @@ from typing import ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates, spline_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.errors import InputError
+from dvc.images.filters import spline_coefficients
 from dvc.images.image import Grid, Mask
 
 _T = TypeVar("_T", np.float32, np.float64)
@@ -329,7 +330,7 @@ class SampledDisplacement:
         low, high = (np.array([edge(axis) for axis in np.nonzero(~undefined)]) for edge in (np.min, np.max))
         box = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
         values = _carried_past_borders(values[box], undefined[box], grid.spacing_mm)
-        coefficients = np.stack([spline_filter(values[..., c], order=3, mode="mirror") for c in range(3)])
+        coefficients = np.stack([spline_coefficients(values[..., c], np.float64) for c in range(3)])
         object.__setattr__(self, "grid", grid)
         object.__setattr__(self, "displacement_mm", frozen(displacement_mm, np.float64))
         object.__setattr__(self, "_coefficients", frozen(coefficients, np.float64))

@@ -1,10 +1,11 @@
 """Distances from the border of a mask: of voxels' faces, or finer than its voxels."""
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt
 from scipy.special import ndtri
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.images.filters import gaussian
 
 _BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
 _SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
@@ -22,7 +23,7 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     distribution of the distance over s, which gives the distance near the border. Further away it is that to the
     nearest place of this border.
     """
-    blurred = gaussian_filter(inside.astype(np.float64), _BLUR, mode="nearest")
+    blurred = gaussian(inside.astype(np.float64), _BLUR, "nearest")
     sure = (blurred > _SURE) & (blurred < 1.0 - _SURE)
     normal = np.stack([np.gradient(blurred, h, axis=axis)[sure] for axis, h in enumerate(spacing_mm)], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
@@ -43,7 +44,7 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
         squares += (np.broadcast_to(at, inside.shape)[far] * spacing - of[there]) ** 2  # an axis at a time: less memory
     depth[far] *= np.sqrt(squares)
     depth[sure] = near_mm
-    depth = gaussian_filter(depth, _EVEN, mode="nearest")
+    depth = gaussian(depth, _EVEN, "nearest")
     return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))
 
 

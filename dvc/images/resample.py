@@ -4,9 +4,10 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, frozen
+from dvc.images.filters import gaussian, spline_coefficients
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import carry_values, sample_values
 from dvc.threads import in_parts
@@ -39,7 +40,7 @@ def fill_missing(image: Image) -> Image:
 def smoothed(image: Image, sigma_mm: float) -> Image:
     """The image blurred by a Gaussian of ``sigma_mm`` in space; missing voxels stay missing."""
     sigma = sigma_mm / image.grid.spacing_mm
-    values = gaussian_filter(fill_missing(image).values, sigma, mode="nearest")
+    values = gaussian(fill_missing(image).values, sigma, "nearest")
     return Image(image.grid, np.where(image.missing, np.float32(np.nan), values))
 
 
@@ -99,7 +100,7 @@ class Carrier:
     def __init__(self, image: Image, order: int = 3) -> None:
         values = fill_missing(image).values
         self.image, self._cubic = image, order > 1
-        self._values = frozen(spline_filter(values, 3, np.float32, "mirror") if self._cubic else values, np.float32)
+        self._values = frozen(spline_coefficients(values, np.float32) if self._cubic else values, np.float32)
         missing = image.missing
         self._gaps = frozen(missing if missing.any() else np.zeros((0, 0, 0)), np.float32)
 

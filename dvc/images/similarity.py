@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from dvc.arrays import Float32Array
+from dvc.images.filters import gaussian
 from dvc.images.image import Image, Mask
 
 _WINDOW_MM = 2.5
@@ -23,12 +23,12 @@ class Windows:
         self.shape, self.box = mask.inside.shape, mask.box()
         self.known = np.logical_and.reduce([mask.inside[self.box], *(np.isfinite(v[self.box]) for v in shown)])
         self._sigma = _WINDOW_MM / mask.grid.spacing_mm
-        weight = gaussian_filter(self.known.astype(np.float32), self._sigma, mode="constant")
+        weight = gaussian(self.known.astype(np.float32), self._sigma, "constant")
         self._weight = np.where(self.known, np.maximum(weight, 1e-3), 1.0)
 
     def mean(self, values: Float32Array) -> Float32Array:
         """Local means of values in the box, zero where not known."""
-        return np.asarray(gaussian_filter(values, self._sigma, mode="constant") / self._weight, dtype=np.float32)
+        return np.asarray(gaussian(values, self._sigma, "constant") / self._weight, dtype=np.float32)
 
     def structure(self, image: Float32Array) -> "Structure":
         """An image (ni, nj, nk) as the windows see it."""

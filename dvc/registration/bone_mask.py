@@ -7,9 +7,10 @@ alignment then follows soft tissue, and a strain that looks sound is measured re
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt
 
 from dvc.arrays import BoolArray, Float32Array
+from dvc.images.filters import gaussian
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
 
@@ -58,7 +59,7 @@ def _gradient(image: Image) -> Float32Array:
     blur = np.maximum(_BLUR_MM / spacing, _LEAST_BLUR)
     squared = np.zeros_like(values)
     for edge, order in zip(spacing, np.eye(3, dtype=int), strict=True):
-        squared += (gaussian_filter(values, blur, order=order) / np.float32(edge)) ** 2
+        squared += (gaussian(values, blur, order=order) / np.float32(edge)) ** 2
     return np.sqrt(squared)
 
 

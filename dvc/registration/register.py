@@ -183,10 +183,16 @@ def register(
         engine.check_start(start)
     own = Worker(chosen.threads) if worker is None else nullcontext(worker)
     with own as runner, ThreadPoolExecutor(1) as beside:
+        rigid = bone if chosen.align_on == "bone" else None
+        fixed, moving, within, rigid, tissues, turn = _upright(reference, loaded, body, rigid, tissues)
+        tell("aligning", 0.0)
+        # Only now: it is done while the worker aligns, and has not kept it waiting.
         beside.submit(engine.prepare)
         noise = beside.submit(noise_of, reference, loaded, body)
         doubt = beside.submit(mirrored_doubt, reference, bone) if bone and chosen.align_on == "bone" else None
-        pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
+        alignment = _alignment(fixed, moving, within, rigid, chosen, runner)
+        pair = AlignedPair.of(fixed, moving, alignment.motion, within, rigid, tissues)
+        tell("aligning", 1.0)
         of_noise = noise.result()  # known before the alignment, as a rule
         if doubted := doubt.result() if doubt else "":
             _log.warning(doubted)
@@ -203,11 +209,10 @@ def register(
     )  # fmt: skip
 
 
-def _aligned(
-    reference: Image, loaded: Image, body: Mask, bone: Mask | None, labels: LabelMap | None, settings: Settings,
-    worker: Worker, tell: Progress,
-) -> tuple[AlignedPair, Alignment, FloatArray]:  # fmt: skip
-    """The images without bias field, aligned, in a world whose axes are those of the unloaded one; and its rotation.
+def _upright(
+    reference: Image, loaded: Image, body: Mask, bone: Mask | None, labels: LabelMap | None
+) -> tuple[Image, Image, Mask, Mask | None, LabelMap | None, FloatArray]:
+    """The images without bias field, and the masks, in a world whose axes are the unloaded image's; and its rotation.
 
     elastix draws samples from a box along the world's axes, which of an oblique image holds a part or nothing.
     """
@@ -218,21 +223,23 @@ def _aligned(
     def turned(scan: _Scan) -> _Scan:
         return replace(scan, grid=scan.grid.moved_by(turn.T, np.zeros(3)))
 
-    tell("aligning", 0.0)
     scans = (reference, upright), (loaded, loaded.toward_lps())
-    bright = (reordered_to_lps(scan.grid, bright_voxels(scan)) for scan, _ in scans)  # known by then, as a rule
+    bright = (reordered_to_lps(scan.grid, bright_voxels(scan)) for scan, _ in scans)
     fixed, moving = (turned(without_bias_field(scan, where)) for (_, scan), where in zip(scans, bright, strict=True))
     body, labels = turned(body.toward_lps()), labels and turned(labels.toward_lps())
-    on = settings.align_on
-    rigid = turned(bone.toward_lps()) if bone and on == "bone" else None
-    if on == "none":
-        alignment = not_aligned(fixed, moving, body)
-        if settings.engine.needs_one_contrast:  # a rigid alignment refuses it by itself
-            refuse_turned_contrast(fixed, moving, body, alignment.motion)
-    else:
-        alignment = worker.run("aligning the bone", align, fixed, moving, rigid or body, on, _seeds(settings)[0])
-    tell("aligning", 1.0)
-    return AlignedPair.of(fixed, moving, alignment.motion, body, rigid, labels), alignment, turn
+    return fixed, moving, body, bone and turned(bone.toward_lps()), labels, turn
+
+
+def _alignment(
+    fixed: Image, moving: Image, body: Mask, bone: Mask | None, settings: Settings, worker: Worker
+) -> Alignment:
+    """How the bone, or all of the image, moved; or no motion."""
+    if (on := settings.align_on) != "none":
+        return worker.run("aligning the bone", align, fixed, moving, bone or body, on, _seeds(settings)[0])
+    alignment = not_aligned(fixed, moving, body)
+    if settings.engine.needs_one_contrast:  # a rigid alignment refuses it by itself
+        refuse_turned_contrast(fixed, moving, body, alignment.motion)
+    return alignment
 
 
 def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:

@@ -19,13 +19,14 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import binary_erosion, convolve, spline_filter
+from scipy.ndimage import binary_erosion, convolve
 from scipy.spatial.transform import Rotation
 
 from dvc import threads
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.protocol import RigidMotion
 from dvc.errors import InputError, RegistrationError
+from dvc.images.filters import spline_coefficients
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import fill_missing, sampled, smoothed, thinned
 
@@ -226,7 +227,7 @@ class _Regression:
 
 def _scenes(loaded: Image) -> dict[float, Image]:
     """The loaded image by its blur: cubic coefficients without, and values at fewer voxels the more it is blurred."""
-    scenes, now = {0.0: Image(loaded.grid, spline_filter(loaded.values, 3, np.float32, "mirror"))}, loaded
+    scenes, now = {0.0: Image(loaded.grid, spline_coefficients(loaded.values, np.float32))}, loaded
     for before, blur in pairwise(sorted(_BLURS_MM)):
         now = smoothed(now, float(np.sqrt(blur**2 - before**2)))
         scenes[blur] = now = thinned(now, _every(now.grid, blur))

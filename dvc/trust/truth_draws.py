@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d
 
 from dvc.arrays import FloatArray
+from dvc.images.filters import gaussian
 from dvc.trust.error_model import ErrorTable
 
 _STEPS = 4  # of the lattice that noise at scattered points is drawn on, within a correlation length
@@ -36,7 +37,7 @@ class GaussianField:
 
     def drawn(self) -> FloatArray:
         """Draw the values at the points, (n,)."""
-        smooth = gaussian_filter(self._random.standard_normal(self._shape), self._width, mode="wrap")
+        smooth = gaussian(self._random.standard_normal(self._shape), self._width, "wrap")
         return np.asarray(self._scale * smooth.ravel()[self._at])
 
 

@@ -46,12 +46,18 @@ class Plan:
 
     def register(self, name: str, loaded: Image, start: Deformation | None, worker: Worker, tell: Tell) -> Registered:
         """Register a loaded image, or the repeat scan if its ``name`` is "repeat", and the pair's twin."""
-        Thread(target=_load_what_draws, daemon=True).start()  # while the worker is at work
+        drawing = Thread(target=_load_what_draws, daemon=True)
+
+        def told(stage: str, fraction: float) -> None:
+            if drawing.ident is None:  # now that the worker is at work, which imports here would have kept waiting
+                drawing.start()
+            tell(stage, fraction)
+
         is_repeat = name == REPEAT
         of, how = self.subject, self.settings.of_repeat() if is_repeat else self.settings
         found = dvc.register(
             of.reference, loaded, bone=of.bone, tissue=of.tissue, labels=of.labels, settings=how, start=start,
-            worker=worker, progress=tell,
+            worker=worker, progress=told,
         )  # fmt: skip
         twin = _twin_check(found, of, start, worker, tell) if self.twin and not is_repeat else None
         return found, twin

@@ -9,11 +9,12 @@ moving image's gradient at places between voxels is correlated with its noise th
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
+from scipy.ndimage import binary_dilation
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.compiled import njit
 from dvc.deformation.bspline import Table
+from dvc.images.filters import gaussian, spline_coefficients
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import cubic_at
 from dvc.images.resample import fill_missing
@@ -64,7 +65,7 @@ class ImagePair:
         self.inside = frozen(inside & ~binary_dilation(missing) if missing.any() else inside, np.bool_)
         self._fixed = np.ascontiguousarray(fill_missing(fixed).values)
         filled = fill_missing(moving).values
-        splines = np.ascontiguousarray(spline_filter(filled, order=3, mode="mirror", output=np.float32))
+        splines = spline_coefficients(filled, np.float32)
         start = moving.grid.indices_of(self.grid.origin_mm)
         ends = moving.grid.indices_of(self.grid.origin_mm + self.grid.direction.T)
         self._scene: _Scene = (splines, _gaps(moving, rim_mm), np.ascontiguousarray((ends - start).T), start)
@@ -132,7 +133,7 @@ def _gain(both: FloatArray, own: FloatArray, sigma: FloatArray) -> FloatArray:
         padded = np.pad(sums, [(0, -n % t) for n, t in zip(shape, times, strict=True)])
         i, j, k = padded.shape // times
         coarse = padded.reshape(i, times[0], j, times[1], k, times[2]).sum(axis=(1, 3, 5))
-        return np.asarray(gaussian_filter(coarse, sigma / times, mode="constant"))
+        return np.asarray(gaussian(coarse, sigma / times, "constant"))
 
     smooth = windowed(own)
     gain = windowed(both) / np.maximum(smooth, 1e-9 * smooth.max() + 1e-30)

@@ -1,0 +1,47 @@
+"""Filters on several threads give what scipy gives, bit for bit."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, spline_filter
+
+from dvc import threads
+from dvc.images.filters import gaussian, spline_coefficients
+
+SHAPES = (33, 21, 17), (2, 40, 3), (1, 5, 6), (8, 1, 1)
+
+
+@pytest.fixture(params=[1, 2, 3])
+def count(request):
+    before = threads.count()
+    threads.use(request.param)
+    yield request.param
+    threads.use(before)
+
+
+def values_of(shape, dtype):
+    return np.random.default_rng(1).normal(size=shape).astype(dtype)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_gaussians_are_those_of_scipy(shape, dtype, count):
+    values = values_of(shape, dtype)
+    for sigma, mode in product((0.7, (2.0, 0.0, 1.5)), ("nearest", "constant", "reflect", "wrap")):
+        for given in (values, np.asfortranarray(values)):
+            found = gaussian(given, sigma, mode)
+            assert found.dtype == dtype
+            np.testing.assert_array_equal(found, gaussian_filter(values, sigma, mode=mode))
+    np.testing.assert_array_equal(gaussian(values, 1.0, order=(0, 1, 0)), gaussian_filter(values, 1.0, order=(0, 1, 0)))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_coefficients_are_those_of_scipy(shape, count):
+    values = values_of(shape, np.float32)
+    for dtype in (np.float32, np.float64):
+        found = spline_coefficients(values, dtype)
+        assert found.dtype == dtype
+        np.testing.assert_array_equal(found, spline_filter(values, 3, dtype, "mirror"))
