@@ -34,7 +34,7 @@ class CoverageRow(OfCondition):
     left_over : float
         Mean error minus its expected bias.
     figures_within : float
-        Fraction of the tissue's figures (median, 90th and 95th percentile, volumes above 0.1 and 0.3) inside their
+        Fraction of the tissue's statistics (median, 90th and 95th percentile, volumes above 0.1 and 0.3) inside their
         intervals, over the runs; 0.95 over all motions and tissues by construction of the widening. The correlated
         field of the intervals is left out, because it averages out over a tissue.
     normal_strain_within, shear_strain_within, displacement_within : float
@@ -199,7 +199,7 @@ def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation
 
 
 def _scores(run: ErrorSamples, tissue: str, table: ErrorTable) -> FloatArray:
-    """Distance of the true figures of a tissue from the middle of figures drawn, in units of the interval there.
+    """Distance of the true statistics of a tissue from the middle of those drawn, in units of the interval there.
 
     Soft tissue is drawn tissue by tissue, and its figures are those of all.
     """

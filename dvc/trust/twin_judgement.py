@@ -86,7 +86,7 @@ def _believed(
 
 
 def _figures(name: str, true: FloatArray, of_twin: Uncertainty) -> list[float]:
-    """By how much the intervals of a tissue's figures have to be wider for each to come back within the far end."""
+    """By how much the intervals of a tissue's statistics have to be wider for each to come back within the far end."""
     factors = []
     for interval in of_twin.intervals:
         if interval.region == name and interval.figure in _FIGURES:
