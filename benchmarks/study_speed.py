@@ -28,10 +28,10 @@ HERE = Path(__file__).resolve().parents[1]
 
 def timed(tree: Path, *arguments: str) -> dict[str, float]:
     """Wall and processor seconds and peak memory (GiB) of one command of mrstrain in a source tree."""
+    environment = os.environ | {"PYTHONPATH": str(tree)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed copy holds the bytecode of its modules
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mrstrain", *arguments], env=os.environ | {"PYTHONPATH": str(tree)}
-    )
+    process = subprocess.Popen([sys.executable, "-m", "mrstrain", *arguments], env=environment)
     peak = peak_kib(process)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
