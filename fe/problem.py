@@ -285,7 +285,7 @@ def _unusual(mesh: TetMesh, materials: Materials, plate: Plate, load: LoadStep) 
     if pressure_mpa > _MOST_STIFFNESSES * stiffest_mpa:
         raise InputError(
             f"{told}, over {_MOST_STIFFNESSES:g} times the shear modulus of the stiffest tissue ({stiffest_mpa:.3g} "
-            "MPa): no tissue bears it. Forces are in N and moduli in MPa; check both."
+            "MPa): no tissue withstands it. Forces are in N and moduli in MPa; check both."
         )
     inward_mm, along_mm = (load.normal_mm or 0.0) - plate.gap_mm, abs(load.shear_mm or 0.0)
     if max(inward_mm, along_mm) > size_mm:

@@ -362,7 +362,7 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
     if unknown := ", ".join(one.load for one in loads if one.case.error is None):
         what = "the measurement has no error model, so its uncertainty is unknown"
         if not loads[0].bones:
-            what = "the error of the measurement is known by distance to bone only, so its uncertainty is unknown"
+            what = "the error model needs the distance to bone, so the measurement uncertainty is unknown"
             soft = ", ".join(loads[0].labels.names.values())
             notes.append(f"The label map has no bone; all of its labels ({soft}) are compared as soft tissue.")
         notes.append(f"{unknown}: {what} and no difference is significant.")

@@ -126,14 +126,14 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     }
     cause = "the model itself is wrong: mesh, inputs and measurement do not explain the difference"
     if any(lacking.values()):
-        cause = "the measurement does not explain the difference, but inputs or meshes that are not given below may"
+        cause = "the measurement does not explain the difference, but a mesh or input listed as not given may do so"
     words = [
-        f"The comparison error exceeds the expanded validation uncertainty in {beyond} of {len(strains)} figures of "
+        f"The comparison error exceeds the expanded validation uncertainty in {beyond} of {len(strains)} quantities of "
         f"all models in all soft tissue. There, {cause}."
     ]
     words += [f"{u} not given: {', '.join(dict.fromkeys(names))}." for u, names in lacking.items() if names]
     if unknown := dict.fromkeys(one.figure for one in figures if np.isnan(one.error)):
-        words.append(f"There is no D, and no E, beyond the range of the measured curves: {', '.join(unknown)}.")
+        words.append(f"D and E are not defined beyond the range of the measured curves: {', '.join(unknown)}.")
     columns = ("model", "figure", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E from", "to")
     table = Table(
         "Comparison error and validation uncertainty (ASME V&V 20)", columns,

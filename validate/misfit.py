@@ -121,7 +121,7 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[st
     if change > _VOLUME_CHANGE:
         warnings.append(
             f"the mean change of cell volume is {change:.0%}, which is implausible for soft tissue; check that "
-            "displacements have the frame and unit of the coordinates, and that these are the unloaded ones."
+            "displacements have the frame and unit of the coordinates, which must be unloaded."
         )
     return [f"{result.name}: {warning}" for warning in warnings]
 

@@ -49,7 +49,7 @@ _CLOSING = Section(
         "fields that are consistent with the measured one are drawn, and the model's area to each is computed. If an "
         "interval excludes the area as measured, noise and smoothing have shifted the measured curve. Two models "
         "differ significantly if the same one has the smaller area in 97.5 % of the draws, widened like the intervals.",
-        "A measurement without a label map smooths strain discontinuities at tissue interfaces over about 4 mm, and "
+        "A measurement without a label map smooths strain discontinuities at tissue interfaces over 3 to 5 mm, and "
         "noise increases small shear strains; a model does neither. A comparison cannot show effects that the "
         "measurement cannot detect: scanner distortion, creep during a scan, and tissue that slides along a smooth "
         "skin or inside a uniform region. Strain thresholds are not injury thresholds, unless their table says so "
@@ -236,8 +236,8 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
         "The best model over all loads is first; the rank is a range if models are not distinguishable. If the "
         "measurement uncertainty is known, the area is the median over the drawn true fields, with a 95 % interval. "
         "Areas as measured and areas by tissue are given below and in areas.csv. Models of a forward-model comparison "
-        "are last, with their area as measured. The row below the line is a model that predicts zero strain "
-        "everywhere; models that are no better than it are marked in the column rank.",
+        "are last, with their area as measured. The row below the line, no deformation, predicts zero "
+        "strain everywhere; models that are no better than it are marked in the column rank.",
         (nothing,),
     )
 

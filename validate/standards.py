@@ -85,13 +85,13 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
     rows = {r.model: r for r in one.representations if r.tissue == tissue}
     best, nothing = rows[names[0]], rows[NOTHING]
     return (
-        f"{best.model}: the strain in {tissue} represents the measurement within its uncertainty with a probability of "
-        f"{best.probability:.0%} ({best.in_band} of {best.coefficients} coefficients); for a model without "
+        f"{best.model}: the probability of representation in {tissue} is {best.probability:.0%}, weighted by the size "
+        f"of the errors ({best.in_band} of {best.coefficients} coefficients are within their uncertainty); for no "
         f"deformation it is {nothing.probability:.0%}.",
         _accepted(best),
         f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "
-        f"{best.guide_probability:.0%} for {best.model} and {nothing.guide_probability:.0%} for a model without "
-        "deformation. In three dimensions this band is wider than most coefficients, so the first probability, "
+        f"{best.guide_probability:.0%} for {best.model} and {nothing.guide_probability:.0%} for no deformation. "
+        "In three dimensions this band is wider than most coefficients, so the first probability, "
         "with an uncertainty for each coefficient, is more informative.",
     )
 

@@ -129,14 +129,14 @@ def label_tissues(
     chance |= _below_skin(even.values, soft & (left > 0.5), left, spacing, marked)
     if {"fat", "muscle"} <= set(marked) and _marked_levels(even.values, marked) is None:
         notes.append(
-            "Where fat is marked, the image is not brighter than where muscle is marked. Check the names of the marks; "
-            "if fat is suppressed, give an image in which it is bright."
+            "Where fat is marked, the image is not brighter than where muscle is marked. Check the names of the "
+            "strokes; if fat is suppressed, give an image in which it is bright."
         )
     if "muscle" not in chance:
         notes.append("One tissue was found below the skin: its brightness does not separate fat from muscle.")
     because = dict.fromkeys(outside, "they lie outside the body, or in the mask of the bone")
     because |= dict.fromkeys(set(marked) - set(chance), "the image does not show it as a tissue of its own")
-    notes += [f"The marks of {name} were not used: {because[name]}." for name in sorted(because)]
+    notes += [f"The strokes of {name} were not used: {because[name]}." for name in sorted(because)]
     watch(0.9)
     names = [name for name in NAMES.values() if name in chance] + sorted(set(chance) - {*NAMES.values()})
     probability = frozen(np.stack([chance[name] for name in names]), np.float32)

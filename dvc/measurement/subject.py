@@ -57,7 +57,7 @@ class LabelsFromImage:
         if self.unsure <= _MOST_UNSURE:
             return notes
         limits = f"use with care above {100 * _MOST_UNSURE:.0f} %"
-        correct = "Look at its picture, and correct it with marks or by hand."
+        correct = "Look at its picture, and correct it with strokes or by hand."
         return (*notes, f"{self.told.removesuffix('.')} ({limits}). {correct}")
 
 

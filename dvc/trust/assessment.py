@@ -22,8 +22,8 @@ _NOISIER = " even at 1.5 times this noise"
 _LIMITS = {
     "similarity": (0.7, 0.45, 2, "",
         "The registered images agree poorly: local similarity {value} ({limits})."),
-    "unlikeness": (0.05, 0.09, 2, "", "The registered images differ by more than noise as strong as in the air "
-        f"explains: local similarity is {{value}} below what it allows ({{limits}}{_NOISIER}). Check that both images "
+    "unlikeness": (0.05, 0.09, 2, "", "The registered images differ by more than the noise measured in the air "
+        f"explains: local similarity is {{value}} too low ({{limits}}{_NOISIER}). Check that both images "
         "show the same subject, scanned with the same protocol. Parallel imaging and filters change the noise in the "
         "tissue."),
     "offset": (0.07, 0.12, 0, "%", "The images differ by an offset in brightness, {value} of the tissue's brightness "

@@ -42,7 +42,7 @@ def label(
     ] = None,
     masks: BoneAndBody, strokes: Marks, drawn: GivenLabels,
 ) -> None:  # fmt: skip
-    """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few marks.
+    """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few strokes.
 
     With --from and --labels, transfer another subject's label map; with --labels alone, correct one of this image.
     """
@@ -105,7 +105,7 @@ def phantom(
     snr: Annotated[float, typer.Option(help="Signal of fat over the standard deviation of the noise.")] = 25.0,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False, *, shape: HeelShape,
 ) -> None:  # fmt: skip
-    """Make images of a synthetic heel under Load0 to Load4, with exactly known strain."""
+    """Make images of a phantom heel under Load0 to Load4, with exactly known strain."""
     from phantoms import LOADS
 
     edges = (spacing, spacing, spacing if slice_spacing is None else slice_spacing)
@@ -152,7 +152,7 @@ def accuracy(
         list[int] | None,
         typer.Option(
             min=0,
-            help="Seed of the heel. Default: 1 and 2; 9000 to 9999 are for published figures. Repeat for several.",
+            help="Seed of the heel. Default: 1 and 2; 9000 to 9999 are for published results. Repeat for several.",
         ),
     ] = None,
     workers: Workers = None,

@@ -32,10 +32,10 @@ TITLE = "Credibility (ASME V&V 40, FDA)"
 _ABOUT = (
     "Evidence in this report for a credibility assessment after ASME V&V 40-2018 and FDA's guidance of 17 November "
     "2023. The program fills in what it knows and grades nothing: a person judges levels and risk. All else comes from "
-    "the study file, under [credibility]; what is missing there is not given."
+    '[credibility] in the study file; entries missing there are "not given".'
 )
 CODE = (
-    "Order of convergence to a closed form of nearly incompressible tissue, of the displacement and its gradient: P1 "
+    "Order of convergence of displacement and its gradient (closed-form solution, nearly incompressible tissue): P1 "
     "2.01 and 1.01, MINI 2.08 and 1.32, P2 3.08 and 2.01 (benchmarks, The finite elements). RMSE of the measured max. "
     "shear on phantoms of known motion, without and with a label map: fat .028 and .015, muscle .013 and .012, skin "
     ".056 and .028 (README)"
@@ -177,7 +177,8 @@ def _solved(held: Holdings) -> str:
     short = ", ".join(f"{model} {load} {part:.0%}" for model, load, part in loads if part < 1.0)
     reached = f"reached in part: {short}" if short else f"all {len(loads)} loads reached"
     force = f"{100.0 * Tolerance().force:g} % of those on the plate and the fixed nodes"
-    return f"Residual forces at the end of a load: at most {force}, or ten times that where steps linger; {reached}"
+    most = f"at most {force}, or ten times that if the iteration stagnates"
+    return f"Residual forces at the end of a load: {most}; {reached}"
 
 
 def _uncertainties(held: Holdings) -> str:

@@ -105,7 +105,7 @@ def level(
                 _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
         raise RegistrationError("\n".join(failures))
-    told = f"Levelled model, for compare: {target / name}"
+    told = f"Forward-model result, for compare: {target / name}"
     return Outcome(target / name, (*taken, *notes, *smoothed, *failures, told))
 
 
@@ -117,7 +117,7 @@ def _from_record(
     record = MeasuredWith.shared(result_folders(dvc), instead)
     load0 = record.file("load0", instead)
     if load0 is None:
-        raise InputError(f"{record.path} does not tell the unloaded image. Give {instead}.")
+        raise InputError(f"{record.path} does not name the unloaded image. Give {instead}.")
     of_subject, of_engine = fill_subject(files, record), fill_engine(engine, record)
     taken = taken_from_record(dvc, (files, of_subject), (engine, of_engine), more=[str(load0)])
     return load0, of_subject, of_engine, taken

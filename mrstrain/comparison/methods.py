@@ -232,12 +232,12 @@ def _compared(cells: int, criteria: Criteria) -> str:
     (low, high), version = criteria.strains, versions()["mrstrain"]
     return (
         f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
-        "tetrahedra, weighted by volume, in the unloaded configuration. Intensity was compared by the area between the "
-        f"strain-volume curves, for maximum shear strains from {low:g} to {high:g}. Location was compared for tissue "
-        f"above {levels}, in clusters of at least {criteria.least_ml:g} mL, by overlap (Dice 1945), distance of the "
-        "centroids, and 95th percentile of the Hausdorff distance. Agreement cell by cell was assessed by regression, "
-        "concordance (Lin 1989) and limits of agreement (Bland 1986). The modified area validation metric "
-        "(Voyles 2015) was computed over all strains, as measured."
+        "tetrahedra, weighted by volume, in the unloaded configuration. The amount of strain was compared by the area "
+        f"between the strain-volume curves, for maximum shear strains from {low:g} to {high:g}. Location was compared "
+        f"for tissue above {levels}, in clusters of at least {criteria.least_ml:g} mL, by overlap (Dice 1945), "
+        "distance of the centroids, and 95th percentile of the Hausdorff distance. Agreement cell by cell was assessed "
+        "by regression, concordance (Lin 1989) and limits of agreement (Bland 1986). The modified area validation "
+        "metric (Voyles 2015) was computed over all strains, as measured."
     )
 
 

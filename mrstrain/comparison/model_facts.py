@@ -21,7 +21,7 @@ _TAKEN_FROM_THE_MEASUREMENT = {
     ),
     "levelled": (
         "unloaded image and registration", "simulated measurement of the model",
-        "the measurement: what it smooths away is missing from both sides",
+        "detail that the measurement smooths away, in model and measurement",
     ),
 }  # fmt: skip
 """By kind of model: the data, what they were used for, and what they cannot validate."""

@@ -40,7 +40,7 @@ class BoneAndBody(Options):
 
 
 class Marks(Options):
-    """A few marks on the unloaded image."""
+    """A few strokes on the unloaded image."""
 
     panel: ClassVar[str] = "Inputs"
 
@@ -48,7 +48,7 @@ class Marks(Options):
     """Label map of a few strokes in each tissue, from the strokes page, ITK-SNAP, 3D Slicer (.seg.nrrd) or any other
     program."""
     mark_names: Path | None = None
-    """Table of the names of the marks: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon, 6
+    """Table of the names of the strokes: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon, 6
     other."""
 
 
@@ -127,7 +127,7 @@ class RegistrationOptions(EngineOptions):
     align: Literal["bone", "image", "none"] = "bone"
     """What the rigid alignment before the registration uses: the bone, the whole image, or nothing."""
     bending: Positive | None = None
-    """gauss-newton: weight of the bending penalty, 1/mm. Default: chosen for each pair by cross-validation."""
+    """gauss-newton: bending weight, 1/mm. Default: chosen for each pair by cross-validation."""
     volume: NotNegative | None = None
     """gauss-newton: weight of the volume-change penalty, 1/mm3. Default: 300, relaxed if the images indicate a
     volume change."""

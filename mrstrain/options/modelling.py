@@ -96,7 +96,7 @@ class ComparisonDirections(Options):
 
 
 class HeelShape(Options):
-    """Shape of a synthetic heel; ranges as in `phantoms.Heel`."""
+    """Shape of a phantom heel; ranges as in `phantoms.Heel`."""
 
     size: Real = 1.0
     """Scale factor of all shapes; 1 is a calcaneus 67 mm long."""

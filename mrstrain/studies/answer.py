@@ -11,7 +11,7 @@ from validate import NOTHING, Comparison
 
 _NEAREST = (
     " Best match: smallest area between the strain-volume curves of model and measurement in that tissue. A dash: no "
-    "model is better than zero strain everywhere."
+    "model is better than no deformation."
 )
 
 

@@ -179,9 +179,9 @@ class StageRunner:
             if silent_s > call.may_be_silent_s:
                 return future
             if silent_s // _NAME_EVERY_S > before // _NAME_EVERY_S:
-                limit = f"After {duration(call.may_be_silent_s)} it is ended, and the others go on"
+                limit = f"After {duration(call.may_be_silent_s)} it is stopped; the others continue"
                 end = f"{limit}; Ctrl-C ends the run, and finished stages are kept."
-                self._watch(NOTE, f"{call.name} has not gone on for {duration(silent_s)}. {end}", 0.0)
+                self._watch(NOTE, f"{call.name} has made no progress for {duration(silent_s)}. {end}", 0.0)
         return None
 
     def _ended(self, hung: Future[Any]) -> tuple[str, str, float]:
@@ -205,7 +205,7 @@ class StageRunner:
                 self._submit(waiting)
         return (
             call.name,
-            f"It did not go on for {duration(silent_s)} and was ended. The usual causes are a network disk that "
+            f"It made no progress for {duration(silent_s)} and was stopped. The usual causes are a network disk that "
             "does not answer, another run that holds the stage, and a machine that swaps its memory to disk. Run the "
             "study again; finished stages are kept.",
             silent_s,

@@ -38,7 +38,7 @@ def read_errors(path: Path, outcomes: Mapping[str, StageOutcome]) -> dict[str, t
                 values = {name: kind(row[name]) for name, kind in get_type_hints(TissueError).items()}
             except (ValueError, TypeError) as failure:
                 what = f"the error of {row['load']} is damaged ({failure})"
-                raise InputError(f"{path}: {what}. Delete this file; `mrstrain demo` writes it anew.") from failure
+                raise InputError(f"{path}: {what}. Delete this file; `mrstrain demo` replaces it.") from failure
             errors[row["load"]] = (*errors.get(row["load"], ()), TissueError(**values))
     return errors
 

@@ -41,9 +41,9 @@ _OF_FLOOR = (
 HOW_TO_READ = Section(
     "How to read this",
     paragraphs=(
-        "Every pair is a synthetic heel whose strain is known at every point. The error is measured minus true: of the "
-        "maximum shear strain (E1 - E3)/2 (Green-Lagrange), and of the displacement of tissue relative to its bone, at "
-        "one in eight of the heel's voxels.",
+        "Every pair shows a phantom heel whose strain is known at every point. The error is measured minus true: of "
+        "the maximum shear strain (E1 - E3)/2 (Green-Lagrange), and of the displacement of tissue relative to its "
+        "bone, at one in eight of the heel's voxels.",
         "Motions: still (rigid foot motion only), smooth (a smooth flow), sliding (the fat pad slides between "
         "constrained bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as "
         "strong as under the forces of the published experiment), attached-Load1 and attached-Load3 (tissue attached "
@@ -187,7 +187,7 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
 
     note = (
         "Each motion is compared with a model fitted to the other motions. Voxels: true max. shear within 1.96 SD; if "
-        "the model is correct, 95 %. Normal strain, shear strain, displacement: the same for components. Figures: "
+        "the model is correct, 95 %. Normal strain, shear strain, displacement: the same for components. Statistics: "
         "percentiles and volumes of the tissue within the intervals that `register` would give."
     )
     table = Table("Coverage of the error model", columns, tuple(cells(row) for row in rows), note)

@@ -203,7 +203,7 @@ def test_a_figure_that_the_measurement_does_not_show_is_not_counted_as_a_wrong_m
     (section,) = validation_section("Load1", one.errors, ALL)
     above = sum(name.startswith("volume above") for name in rows)
     assert f" of {above} figures" in section.paragraphs[0]  # those with an error
-    assert "There is no D, and no E, beyond the range of the measured curves: median, p95." in section.paragraphs
+    assert "D and E are not defined beyond the range of the measured curves: median, p95." in section.paragraphs
 
 
 def test_a_model_is_called_wrong_only_where_its_mesh_and_inputs_are_known() -> None:
@@ -217,4 +217,4 @@ def test_a_model_is_called_wrong_only_where_its_mesh_and_inputs_are_known() -> N
     assert "the model itself is wrong" in said(error(0.001, 0.002))
     for lacking in (error(np.nan, 0.002), error(0.001, np.nan)):
         assert "wrong" not in said(lacking)
-        assert "not given below may" in said(lacking)
+        assert "listed as not given may" in said(lacking)

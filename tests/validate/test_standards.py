@@ -53,8 +53,8 @@ def test_the_answer_comes_first_and_names_model_tissue_and_probability() -> None
     one = compared(0.0, 0.01)
     first, accepted, guide = answer(one)
     assert first == (
-        "right: the strain in fat represents the measurement within its uncertainty with a probability of 100% (1 of 1 "
-        "coefficients); for a model without deformation it is 0%."
+        "right: the probability of representation in fat is 100%, weighted by the size of the errors (1 of 1 "
+        "coefficients are within their uncertainty); for no deformation it is 0%."
     )
     assert "as the guide asks (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
     assert guide.startswith(
@@ -101,5 +101,5 @@ def test_tables_and_figure_are_written_and_told_in_the_report(tmp_path: Path) ->
     assert (tmp_path / "Load1" / "coefficients.csv").is_file()
     page = (tmp_path / "report.html").read_text()
     assert "Load1, by the standards" in page
-    assert "represents the measurement within its uncertainty with a probability of 100%" in page
+    assert "the probability of representation in fat is 100%" in page
     assert Comparison.read(tmp_path).model_forms[0].d_plus == pytest.approx(done.model_forms[0].d_plus, abs=1e-6)

@@ -79,7 +79,7 @@ def test_marks_outside_the_body_are_told_and_tell_nothing() -> None:
         others = {} if alone else {"fat": ball((0.0, 0.0, -12.0), 2.0)}
         made = label_tissues(body(), BONE, marks=marks(**{name: air}, **others))
         assert made.notes == (
-            f"The marks of {name} were not used: they lie outside the body, or in the mask of the bone.",
+            f"The strokes of {name} were not used: they lie outside the body, or in the mask of the bone.",
         )
         assert volumes(made) == volumes(plain)
 

@@ -64,8 +64,8 @@ def test_marks_that_cannot_be_used_are_told() -> None:
     made = label_tissues(Image(GRID, values), Mask(GRID, radius < 5.0), marks=marks)
     assert set(made.labels.names.values()) == {"bone", "fat"}
     told = "\n".join(made.notes)
-    assert "marks of tendon were not used" in told
-    assert "marks of skin were not used" in told
+    assert "strokes of tendon were not used" in told
+    assert "strokes of skin were not used" in told
     assert "Calcaneus" not in told
 
 

@@ -12,7 +12,7 @@ from mrstrain.models.converge import Converged, Row, _record_variant
 from mrstrain.models.variant_files import variant_folders
 
 NONE = Limit(np.nan, np.nan, 0.1, np.nan)
-SHEAR, PLATE = "maximum shear strain of fat, p50", "plate travel, mm"
+SHEAR, PLATE = "maximum shear strain of fat, p50", "plate displacement, mm"
 
 
 def limit(order: float) -> Limit:

@@ -123,7 +123,7 @@ REFUSED: dict[str, tuple[str, Give]] = {
         "no soft tissue 'talus'",
         lambda out, _: mrstrain.converge(**TISSUES, out=out, edges_mm=EDGES_MM, region="talus")),
     "simulate, a load no tissue bears": (
-        "no tissue bears it", lambda out, _: mrstrain.simulate(**PAD, out=out, loads=[LoadStep("pressed", 1e9)])),
+        "no tissue withstands it", lambda out, _: mrstrain.simulate(**PAD, out=out, loads=[LoadStep("pressed", 1e9)])),
     "drive, no results": ("no results", lambda out, files: mrstrain.drive(**PAD, dvc=files, out=out)),
     "level, no folder of a model": (
         "not a folder", lambda out, files: mrstrain.level(dvc=files, model=GIVEN / "pad.inp", out=out)),

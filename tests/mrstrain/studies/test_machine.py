@@ -207,10 +207,10 @@ def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, 
         assert runner._client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.worker_ttl) is None
         name, outcome, seconds = runner.next()
         assert (name, round(seconds)) == ("hangs", 4)
-        assert "did not go on for 4 s and was ended" in outcome
+        assert "made no progress for 4 s and was stopped" in outcome
         assert "Run the study again" in outcome
         ((_, sentence, _),) = [event for event in told if event[0] == NOTE]
-        assert sentence.startswith("hangs has not gone on for 2 s. After 4 s it is ended, and the others go on")
+        assert sentence.startswith("hangs has made no progress for 2 s. After 4 s it is stopped; the others continue")
         name, outcome, _ = runner.next()
         assert name == "next"
         assert "has no attribute 'no_stage'" in outcome

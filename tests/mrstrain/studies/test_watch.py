@@ -116,7 +116,7 @@ def test_the_page_of_a_long_stage_is_renewed(seen: Seen, monkeypatch: pytest.Mon
     monkeypatch.setattr(watching, "_PAGE_AT_LEAST_EVERY_S", 0.3)
     with seen.watch.reporting():
         seen.watch.told("simulate trebbi", "begun", 0.0)
-        seen.page_with("under way", "renewed every minute")
+        seen.page_with("under way", "updated every minute")
         seen.path.unlink()
         seen.page_with("under way")
 
