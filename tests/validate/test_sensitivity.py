@@ -202,7 +202,7 @@ def test_a_figure_that_the_measurement_does_not_show_is_not_counted_as_a_wrong_m
     assert not any(e.significant for e in unknown)
     (section,) = validation_section("Load1", one.errors, ALL)
     above = sum(name.startswith("volume above") for name in rows)
-    assert f" of {above} figures" in section.paragraphs[0]  # those with an error
+    assert f" of {above} quantities" in section.paragraphs[0]  # those with an error
     assert "D and E are not defined beyond the range of the measured curves: median, p95." in section.paragraphs
 
 
