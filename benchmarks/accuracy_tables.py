@@ -22,6 +22,8 @@ TISSUES = ("fat", "muscle", "skin", "bone")
 USUAL = ("0.8", 25.0)
 CONDITIONS = (("0.8", 12.0), USUAL, ("0.8", 50.0), ("0.8 x 0.8 x 1.6", 25.0), ("1.2", 25.0))
 TO_BONE = "distance to bone, mm"
+LABEL_MAPS = "label-maps"
+"""Folder of the registrations with label maps that are right, too large and too small, each under every motion."""
 
 
 @dataclass(frozen=True)
@@ -183,8 +185,8 @@ def of_engines(own: Results, other: Results) -> None:
     )
 
 
-def of_borders(one: Results, borders: Results) -> None:
-    """With label maps beside without."""
+def of_borders(one: Results, borders: Results, each: Results) -> None:
+    """With label maps beside without; ``each`` of them at one condition, and ``borders`` in turn at all."""
     places = [("fat", None), ("fat", 0.0), ("fat", 1.5), ("muscle", None), ("skin", None), ("bone", None)]
     head = ("fat", "within 1.5 mm of bone", "from 1.5 to 3 mm", "muscle", "skin", "bone", "u")
 
@@ -194,7 +196,7 @@ def of_borders(one: Results, borders: Results) -> None:
             told(results.error("fat", motions, condition, None, off, "u_rmse_mm")),
         ]
 
-    ways = (("one spline", one, None), ("right", borders, 0), ("too large", borders, 1), ("too small", borders, -1))
+    ways = (("one spline", one, None), ("right", each, 0), ("too large", each, 1), ("too small", each, -1))
     show(
         "With label maps, 0.8 mm, SNR 25",
         ("motion", "labels", *head),
@@ -233,7 +235,7 @@ def main() -> None:
     given = parser.parse_args()
     own, other, borders = (Results(given.results / n) for n in ("gauss-newton", "heel-mr", "gauss-newton-borders"))
     of_engines(own, other)
-    of_borders(own, borders)
+    of_borders(own, borders, Results(given.results / LABEL_MAPS))
     show(
         "Voxels whose truth lies within 1.96 standard deviations: mean, least, most",
         ("voxel, SNR", "gauss-newton", "heel-mr", "borders"),

@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import dvc
-from benchmarks.accuracy_tables import CONDITIONS, USUAL, Results
+from benchmarks.accuracy_tables import CONDITIONS, LABEL_MAPS, USUAL, Results
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
@@ -104,7 +104,8 @@ def engines() -> Figure:
     }  # fmt: skip
     for one, (title, (tissue, to_bone_mm)) in zip(axes, shown.items(), strict=True):
         for place, (engine, (label, colour)) in enumerate(ENGINES.items()):
-            results, off = Results(RESULTS / "accuracy" / engine), 0 if engine.endswith("borders") else None
+            folder, off = (LABEL_MAPS, 0) if engine.endswith("borders") else (engine, None)
+            results = Results(RESULTS / "accuracy" / folder)
             heights = [
                 results.error(tissue, motions=(motion,), to_bone_mm=to_bone_mm, labels_off=off) for motion in motions
             ]
