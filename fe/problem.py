@@ -2,6 +2,7 @@
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Self
 
@@ -161,7 +162,8 @@ class Problem:
     InputError
         If an argument has the wrong type, such as a file path in place of a mesh; if a region has no material, a cell
         has no region or is there twice, or a surface set is missing; if tissue is not connected to a fixed surface; if
-        the plate comes from the wrong side; or if a load cannot be applied by the plate, or borne by any tissue.
+        the plate comes from the wrong side; or if a load cannot be applied by the plate, passed on the way, or borne by
+        any tissue.
     """
 
     mesh: TetMesh
@@ -186,6 +188,7 @@ class Problem:
                 )
         check_materials(mesh, self.materials)
         check_loads(self.plate, self.loads)
+        _check_passed(self.plate, self.loads[0], self.passed)
         held = np.unique(np.concatenate([mesh.facets[name].ravel() for name in fixed]))
         _check_bonded(mesh, held, fixed)
         on_surface = np.setdiff1d(np.unique(mesh.facets[SKIN]), held)
@@ -243,6 +246,27 @@ def _passed(first: LoadStep, loads: Sequence[LoadStep], plate_of: Mapping[str, P
         if load.target.values[0] < first.target.values[0]:
             smaller.setdefault(float(load.target.values[0]), load)
     return tuple(smaller[value] for value in sorted(smaller))
+
+
+def _check_passed(plate: Plate, first: LoadStep, passed: Sequence[LoadStep]) -> None:
+    """InputError for loads that the first load of a path cannot pass on its way."""
+    if not passed:
+        return
+    if plate.turns:
+        raise InputError(f"{first.name} cannot pass other loads: its plate rotates, and each load releases it anew.")
+    check_loads(plate, passed)
+    way = [*passed, first]
+    for load, following in pairwise(way):
+        if load.sheared or load.target.displaced[0] != first.target.displaced[0]:
+            raise InputError(
+                f"{first.name} cannot pass {load.name}, which has shear, or prescribes force where {first.name} "
+                "prescribes displacement, or the other way round."
+            )
+        if not load.target.values[0] < following.target.values[0]:
+            raise InputError(
+                f"Loads that are passed must come in ascending order and be smaller than {first.name}: {load.name} is "
+                f"not smaller than {following.name}."
+            )
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 import fe
 import mrstrain
-from dvc.errors import WorkerError
+from dvc.errors import InputError, WorkerError
 from fe import LoadStep, Plate, Problem, problems_of
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.models.simulate import LOADS as PUBLISHED, solve_in_folder
@@ -40,6 +40,22 @@ def test_a_load_passes_only_loads_of_an_equal_plate() -> None:
     for other in (tilted, aside):
         assert passed([SMALL, LARGE], {"small": PLATE, "large": other}) == {"small": [], "large": []}
     assert passed([SMALL, LoadStep("twin", 1.0), LARGE])["large"] == ["small"]  # the first of its path
+
+
+@pytest.mark.parametrize(
+    ("those", "plate", "why"),
+    [
+        ([SHEARED], PLATE, "cannot pass sheared, which has shear"),
+        ([LoadStep("in", normal_mm=0.5)], PLATE, "cannot pass in, which has shear, or prescribes force"),
+        ([LARGE], PLATE, "large is not smaller than large"),
+        ([LoadStep("middle", 2.0), SMALL], PLATE, "middle is not smaller than small"),
+        ([LoadStep("pulled", -1.0)], PLATE, "must be above 0 N"),
+        ([SMALL], Plate(DOWN, ALONG, turns=True), "its plate rotates"),
+    ],
+)
+def test_loads_that_cannot_be_passed_are_refused(those, plate, why) -> None:
+    with pytest.raises(InputError, match=why):
+        Problem(dome((3, 4, 4)), LAWS, plate, [LARGE], passed=those)
 
 
 def test_passed_loads_are_solved_once_with_the_same_bits() -> None:
