@@ -81,6 +81,7 @@ def shown(value: object) -> str:
 
 def _misfit(name: str, value: object, hint: Any) -> tuple[str, object, Any] | None:
     """What of a value is not of the kind of a hint; arrays and literal values are left to who takes them."""
+    hint = _meant(hint)
     if isinstance(hint, TypeVar):
         hint = Union[hint.__constraints__]  # noqa: UP007 - of a tuple
     origin, inner = get_origin(hint), get_args(hint)
@@ -111,8 +112,14 @@ def _first(parts: Iterable[tuple[str, object, Any]]) -> tuple[str, object, Any] 
     return next(filter(None, (_misfit(*part) for part in parts)), None)
 
 
+def _meant(hint: Any) -> Any:
+    """What a hint stands for that is an alias, as NDArray is one from NumPy 2.5 on."""
+    return getattr(get_origin(hint) or hint, "__value__", hint)
+
+
 def _words(hint: Any) -> str:
     """What a type hint asks for."""
+    hint = _meant(hint)
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (UnionType, Union):
         paths = {each for each in inner if PathLike in (each, get_origin(each)) or each is Path}

@@ -339,7 +339,7 @@ def test_where_single_precision_does_not_do_double_does() -> None:
     """Of numbers that are nothing in single precision."""
     random = np.random.default_rng(3)
     turn, _ = np.linalg.qr(random.normal(size=(60, 60)))
-    easy = sparse.triu(turn * np.geomspace(1e-2, 1.0, 60) @ turn.T, format="csr")
+    easy = sparse.csr_matrix(np.triu(turn * np.geomspace(1e-2, 1.0, 60) @ turn.T))
     right = random.normal(size=60)
     for matrix, rough, factorisations in ((easy, True, 1), (1e-60 * easy, False, 2)):
         solver = Solver(matrix.indptr, matrix.indices)
@@ -352,7 +352,7 @@ def test_where_single_precision_does_not_do_double_does() -> None:
 @needs_mkl
 def test_after_factorisations_that_failed_comes_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those in single and in double precision; and the next load begins in single again."""
-    matrix = sparse.triu(sparse.eye(40) * 3.0 + np.ones((40, 40)), format="csr")
+    matrix = sparse.csr_matrix(np.triu(3.0 * np.eye(40) + np.ones((40, 40))))
     right = np.arange(40.0)
     solver = Solver(matrix.indptr, matrix.indices)
     found = solver.solve(matrix.data, right, 1e-6)

@@ -132,7 +132,7 @@ def test_a_speck_far_away_moves_nothing_and_clusters_tell_their_mean() -> None:
     assert clean.centroids_mm == pytest.approx(5.0 / 6.0)
     far = measured.copy()
     far[np.argmax(points[:, 0])] = 2.9
-    assert overlap("m", "l", 0.3, far, model, cells) == clean
+    assert repr(overlap("m", "l", 0.3, far, model, cells)) == repr(clean)  # from Python 3.13 on, NaN is not equal
     assert overlap("m", "l", 0.3, far, model, cells, 0.0) != clean
     told = with_intervals([clean], [far] * 4, {"m": model}, cells, 0.1, 1.0)[0]
     assert (told.dice_low, told.dice_high) == pytest.approx((clean.dice, clean.dice))
