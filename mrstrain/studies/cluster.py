@@ -169,7 +169,7 @@ class StageRunner:
         advice = "The usual cause is too little memory: use fewer workers, or machines with more memory."
         return name, f"The worker of this stage stopped more than once ({error}). {advice}", 0.0
 
-    def _hung(self) -> Future[Any] | None:
+    def _hung(self) -> "Future[Any] | None":
         """A stage that has told nothing new for too long, if there is one; those that may become one are named."""
         for future, call in self._under_way.items():
             if call.name not in self._silent_s:  # it waits for a worker
@@ -184,7 +184,7 @@ class StageRunner:
                 self._watch(NOTE, f"{call.name} has made no progress for {duration(silent_s)}. {end}", 0.0)
         return None
 
-    def _ended(self, hung: Future[Any]) -> tuple[str, str, float]:
+    def _ended(self, hung: "Future[Any]") -> tuple[str, str, float]:
         """End a stage that hangs with its worker, which is started anew where a nanny watches it.
 
         What waits for that worker is queued anew: Dask would count the end of the worker against it.
