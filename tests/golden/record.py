@@ -24,7 +24,8 @@ TOLERANCE = 1e-7
 """Of figures, over the quantity's root mean square; files that keep fewer digits are held to theirs (``_digits``)."""
 ELSEWHERE = {"phantom": 1e-6} | dict.fromkeys(("smooth", "interfaces", "elastix", "study"), 1e-3)
 """The same on other machines than the record's, of maps in single precision and of scenes that register: iterations
-that stop at a small step stop elsewhere. With instructions of another processor displacement moved by 1e-5, an interval's share of volume by 3e-4."""
+that stop at a small step stop elsewhere. With instructions of another processor displacement moved by 1e-5, an
+interval's share of volume by 3e-4."""
 _JUMPS = "decomposition.csv: probability", "decomposition.csv: guide_probability"
 """Shares of the coefficients within their interval, by weight: on another machine one may lie beyond its end."""
 _PACKAGES = ("numpy", "scipy", "numba", "itk-elastix", "SimpleITK", "scikit-image", "pypardiso", "mkl")
