@@ -188,7 +188,7 @@ class Problem:
                 )
         check_materials(mesh, self.materials)
         check_loads(self.plate, self.loads)
-        _check_passed(self.plate, self.loads[0], self.passed)
+        _check_passed(self.plate, self.loads, self.passed)
         held = np.unique(np.concatenate([mesh.facets[name].ravel() for name in fixed]))
         _check_bonded(mesh, held, fixed)
         on_surface = np.setdiff1d(np.unique(mesh.facets[SKIN]), held)
@@ -248,10 +248,13 @@ def _passed(first: LoadStep, loads: Sequence[LoadStep], plate_of: Mapping[str, P
     return tuple(smaller[value] for value in sorted(smaller))
 
 
-def _check_passed(plate: Plate, first: LoadStep, passed: Sequence[LoadStep]) -> None:
+def _check_passed(plate: Plate, loads: Sequence[LoadStep], passed: Sequence[LoadStep]) -> None:
     """InputError for loads that the first load of a path cannot pass on its way."""
     if not passed:
         return
+    first = loads[0]
+    if twice := clash(load.name for load in (*passed, *loads)):  # states are kept by name
+        raise InputError(f"Two loads are named {twice}; rename one of them.")
     if plate.turns:
         raise InputError(f"{first.name} cannot pass other loads: its plate rotates, and each load releases it anew.")
     check_loads(plate, passed)

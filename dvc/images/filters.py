@@ -1,7 +1,7 @@
 """Filters that go along one axis after the other, on all threads: Gaussians, and the coefficients of cubic splines.
 
 Values are those of `scipy.ndimage.gaussian_filter` and `spline_filter`, bit for bit. Along the first axis neighbours
-are far apart in memory, so a part is copied together first; that is faster on one thread too.
+are far apart in memory, so a part is copied together first.
 """
 
 from collections.abc import Callable

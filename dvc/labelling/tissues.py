@@ -185,8 +185,8 @@ def _in_soft_tissue(
             continue
         if name == NAMES[1] and bone.any():
             raise InputError(
-                f"The marks of {name} lie outside the mask of the bone. If they mark another bone, give its own name, "
-                "such as talus (mark_names); if not, correct the mask."
+                f"The strokes of {name} lie outside the mask of the bone. If they mark another bone, give its own "
+                "name, such as talus (mark_names); if not, correct the mask."
             )
         if (mark & soft).any():
             inside[name] = mark & soft

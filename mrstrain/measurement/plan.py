@@ -50,7 +50,8 @@ class Plan:
 
         def told(stage: str, fraction: float) -> None:
             if drawing.ident is None:  # now that the worker is at work, which imports here would have kept waiting
-                drawing.start()
+                with suppress(RuntimeError):  # no memory for a thread: imported where it is needed
+                    drawing.start()
             tell(stage, fraction)
 
         is_repeat = name == REPEAT

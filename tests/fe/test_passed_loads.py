@@ -47,7 +47,8 @@ def test_a_load_passes_only_loads_of_an_equal_plate() -> None:
     [
         ([SHEARED], PLATE, "cannot pass sheared, which has shear"),
         ([LoadStep("in", normal_mm=0.5)], PLATE, "cannot pass in, which has shear, or prescribes force"),
-        ([LARGE], PLATE, "large is not smaller than large"),
+        ([LoadStep("equal", 2.5)], PLATE, "equal is not smaller than large"),
+        ([LoadStep("large", 1.0)], PLATE, "Two loads are named 'large'"),
         ([LoadStep("middle", 2.0), SMALL], PLATE, "middle is not smaller than small"),
         ([LoadStep("pulled", -1.0)], PLATE, "must be above 0 N"),
         ([SMALL], Plate(DOWN, ALONG, turns=True), "its plate rotates"),
