@@ -32,7 +32,13 @@ def main() -> None:
         for motion in MOTIONS
         for seed in SEEDS
     ]
-    mrstrain.accuracy(given.work, cases=cases)
+    if (runs := given.work / "runs").exists() and {one.stem for one in runs.glob("*.npz")} - {
+        one.name for one in cases
+    }:
+        parser.error(f"{given.work} has runs of other cases, which would be in the tables")
+    done = mrstrain.accuracy(given.work, cases=cases)
+    if done.failures:
+        raise SystemExit(f"Incomplete: {done.failures}")
     given.out.mkdir(parents=True, exist_ok=True)
     for name in KEPT:
         shutil.copy(given.work / name, given.out / name)

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 _MUCH = 0.05  # volume fraction with deviating det F of nodal patches, above which it is noted
 _CROWD = 0.01  # volume fraction of a region with det F below `CROWDED`, above which it is noted
-_FOLDING, _GAVE_WAY = "cells were about to fold", "the tissue gave way"  # why no equilibrium was found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,8 +131,8 @@ class Simulation:
                 when = began if len(state.curve) > 1 else "before the first equilibrium"
                 notes.append(f"{state.load.name}: the time limit was reached {when}.")
         notes += [
-            f"{state.load.name}: no equilibrium was found beyond {state.reached:.0%} of the load, even with the "
-            f"smallest steps; {_FOLDING if (least := self._least_volume(state)) < CROWDED else _GAVE_WAY} "
+            f"{state.load.name}: no equilibrium was found beyond {state.reached:.0%} of the load, even in the smallest"
+            f" steps; {'cells nearly folded' if (least := self._least_volume(state)) < CROWDED else 'tissue gave way'} "
             f"(lowest det F {least:.2f}). Lower the load, or check its unit and the material parameters."
             for state in self.states
             if state.reached < 1.0 and not state.out_of_time

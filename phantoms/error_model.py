@@ -201,7 +201,7 @@ def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation
 def _scores(run: ErrorSamples, tissue: str, table: ErrorTable) -> FloatArray:
     """Distance of the true statistics of a tissue from the middle of those drawn, in units of the interval there.
 
-    Soft tissue is drawn tissue by tissue, and its figures are those of all.
+    Soft tissue is drawn tissue by tissue, and its statistics are those of all.
     """
     random, names = np.random.default_rng(1), SOFT if tissue == POOLED else (tissue,)
     apart = -(-np.count_nonzero(of_tissue(run.tissue, tissue)) // _SOME)

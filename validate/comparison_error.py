@@ -134,7 +134,7 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     words += [f"{u} not given: {', '.join(dict.fromkeys(names))}." for u, names in lacking.items() if names]
     if unknown := dict.fromkeys(one.figure for one in figures if np.isnan(one.error)):
         words.append(f"D and E are not defined beyond the range of the measured curves: {', '.join(unknown)}.")
-    columns = ("model", "figure", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E from", "to")
+    columns = ("model", "quantity", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E from", "to")
     table = Table(
         "Comparison error and validation uncertainty (ASME V&V 20)", columns,
         tuple((one.model, one.figure, *(_cell(v) for v in astuple(one)[4:])) for one in shown),

@@ -92,11 +92,21 @@ class TissueBasis:
 
 
 def _orthonormal(columns: FloatArray) -> FloatArray:
-    """An orthonormal basis of columns (n, m), without what is shorter than a hundred-thousandth of a unit length."""
-    squares, turns = np.linalg.eigh(columns.T @ columns)
-    turns = np.where(columns.sum(axis=0) @ turns < 0.0, -turns, turns)  # so that the first coefficient is the mean
-    kept = squares > _DEPENDENT**2
-    return np.asarray(columns @ (turns[:, kept] / np.sqrt(squares[kept])))
+    """Columns (n, m) made orthonormal one after the other (Gram and Schmidt), without those the earlier ones can show.
+
+    Each keeps its direction as far as it can. Eigenvectors of the products of columns would not: those of columns that
+    are nearly orthonormal lie anywhere, as rounding has it, and all coefficients with them.
+    """
+    products = columns.T @ columns
+    made = np.zeros((len(products), 0))  # in terms of the columns
+    for column in np.eye(len(products)):
+        further = column
+        for _ in range(2):  # the second time for what rounding left
+            further = further - made @ (made.T @ (products @ further))
+        square = float(further @ products @ further)
+        if square > _DEPENDENT**2:
+            made = np.column_stack([made, further / np.sqrt(square)])
+    return np.asarray(columns @ made)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

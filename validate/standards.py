@@ -86,7 +86,7 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
     best, nothing = rows[names[0]], rows[NOTHING]
     return (
         f"{best.model}: the probability of representation in {tissue} is {best.probability:.0%}, weighted by the size "
-        f"of the errors ({best.in_band} of {best.coefficients} coefficients are within their uncertainty); for no "
+        f"of the errors (coefficients within their uncertainty: {best.in_band} of {best.coefficients}); for no "
         f"deformation it is {nothing.probability:.0%}.",
         _accepted(best),
         f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "

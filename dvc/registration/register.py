@@ -34,6 +34,7 @@ from dvc.worker import Worker
 
 _log = logging.getLogger("dvc.registration")
 
+_PREPARED = 0.2  # of the alignment: images are without bias field, and the worker gets them
 _MOSTLY_BONE = 0.8  # of the body: a shank or a knee is less than half bone
 
 _Scan = TypeVar("_Scan", Image, Mask, LabelMap)
@@ -183,10 +184,11 @@ def register(
         engine.check_start(start)
     own = Worker(chosen.threads) if worker is None else nullcontext(worker)
     with own as runner, ThreadPoolExecutor(1) as beside:
+        tell("aligning", 0.0)
         rigid = bone if chosen.align_on == "bone" else None
         fixed, moving, within, rigid, tissues, turn = _upright(reference, loaded, body, rigid, tissues)
-        tell("aligning", 0.0)
-        # Only now: it is done while the worker aligns, and has not kept it waiting.
+        tell("aligning", _PREPARED)
+        # Only now: it is done while the worker aligns, and has not kept it waiting for its images.
         beside.submit(engine.prepare)
         noise = beside.submit(noise_of, reference, loaded, body)
         doubt = beside.submit(mirrored_doubt, reference, bone) if bone and chosen.align_on == "bone" else None

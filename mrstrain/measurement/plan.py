@@ -49,7 +49,7 @@ class Plan:
         drawing = Thread(target=_load_what_draws, daemon=True)
 
         def told(stage: str, fraction: float) -> None:
-            if drawing.ident is None:  # now that the worker is at work, which imports here would have kept waiting
+            if fraction > 0.0 and drawing.ident is None:  # from now on the worker computes, and is not kept waiting
                 with suppress(RuntimeError):  # no memory for a thread: imported where it is needed
                     drawing.start()
             tell(stage, fraction)

@@ -45,7 +45,7 @@ class Counted:
         (FALLING, FAT, LoadStep("a", 40.0), "softens until its stress falls"),
         (Yeoh.of(0.01, c20_mpa=-0.1), FAT, LoadStep("a", 40.0, 10.0), "softens until its stress falls"),
         (SKIN, SOFT, LoadStep("a", 2.0), r"shear modulus of 0.01 kPa, .* Are they in MPa, entered as kPa\?"),
-        (SKIN, FAT, LoadStep("a", 2.0, 300.0), "about to fold"),
+        (SKIN, FAT, LoadStep("a", 2.0, 300.0), "nearly folded"),
     ],
     ids=["falling skin", "falling steeply", "fat of 10 Pa", "sheared too far"],
 )

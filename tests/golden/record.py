@@ -26,8 +26,6 @@ ELSEWHERE = {"phantom": 1e-6} | dict.fromkeys(("smooth", "interfaces", "elastix"
 """The same on other machines than the record's, of maps in single precision and of scenes that register: iterations
 that stop at a small step stop elsewhere. With instructions of another processor displacement moved by 1e-5, an
 interval's share of volume by 3e-4."""
-_JUMPS = "decomposition.csv: probability", "decomposition.csv: guide_probability"
-"""Shares of the coefficients within their interval, by weight: on another machine one may lie beyond its end."""
 _PACKAGES = ("numpy", "scipy", "numba", "itk-elastix", "SimpleITK", "scikit-image", "pypardiso", "mkl")
 _PERCENTILES = (5, 50, 95)
 _FEW = 16
@@ -95,9 +93,7 @@ def check(scene: str, found: Mapping[str, Quantity]) -> tuple[list[str], str]:
     here = made_with()
     others = [f"{name} {made[name]}, here {here[name]}" for name in made if made[name] != here.get(name)]
     tolerance = ELSEWHERE.get(scene, TOLERANCE) if others else TOLERANCE
-    held = {name: row for name, row in kept.items() if not others or not name.endswith(_JUMPS)}
-    given = {name: quantity for name, quantity in found.items() if name in held or name not in kept}
-    wrong = differences(held, given, bits=not others, tolerance=tolerance)
+    wrong = differences(kept, found, bits=not others, tolerance=tolerance)
     compared = "figures and hashes" if not others else f"figures alone, no hashes (made with {'; '.join(others)})"
     return wrong, f"{len(kept)} quantities, {compared}: {len(wrong) or 'none'} differ"
 

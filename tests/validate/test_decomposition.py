@@ -77,6 +77,21 @@ def test_what_the_basis_shows_does_not_depend_on_the_axes() -> None:
     assert 0.001 < first.residual < 0.1
 
 
+@pytest.mark.parametrize("slab", [False, True])
+def test_coefficients_do_not_hang_on_rounding(slab: bool) -> None:
+    """The coordinates of a tissue change by a millionth of a nanometre; in a slab, polynomials depend on each other."""
+    random = np.random.default_rng(2)
+    points = random.normal(size=(900, 3)) * [30.0, 12.0, 0.0 if slab else 8.0]
+    volumes, values = random.uniform(0.5, 1.5, 900), 0.2 + 0.01 * points[:, 0] + 0.1 * random.random(900)
+    one, other = (
+        TissueBasis.of(at, volumes, 3).coefficients(values)
+        for at in (points, points + 1e-12 * random.normal(size=points.shape) * (points != 0.0))
+    )
+    assert other == pytest.approx(one, abs=1e-9)
+    assert len(one) == (10 if slab else 20)
+    assert one[0] == pytest.approx(np.average(values, weights=volumes))  # the mean, and not less it
+
+
 def test_on_a_sphere_there_are_as_many_functions_as_spherical_harmonics() -> None:
     """On a thin shell polynomials depend on each other: (p + 1)^2 are left of degree p, and none follows rounding."""
     points = np.random.default_rng(5).standard_normal((3000, 3))

@@ -53,8 +53,8 @@ def test_the_answer_comes_first_and_names_model_tissue_and_probability() -> None
     one = compared(0.0, 0.01)
     first, accepted, guide = answer(one)
     assert first == (
-        "right: the probability of representation in fat is 100%, weighted by the size of the errors (1 of 1 "
-        "coefficients are within their uncertainty); for no deformation it is 0%."
+        "right: the probability of representation in fat is 100%, weighted by the size of the errors (coefficients "
+        "within their uncertainty: 1 of 1); for no deformation it is 0%."
     )
     assert "as the guide asks (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
     assert guide.startswith(
