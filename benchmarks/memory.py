@@ -1,4 +1,7 @@
-"""Peak memory of a process and all that it starts, sampled five times a second from /proc (Linux only)."""
+"""Peak memory of a process and all that it starts, sampled from /proc up to five times a second (Linux only).
+
+A look at large processes takes .1 s or more, in which they cannot get new pages. It takes at most 3 % of the time.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import subprocess
 import time
 from pathlib import Path
 
-_EVERY_S = 0.2
+_EVERY_S, _MOST = 0.2, 0.03
 
 
 def peak_kib(process: subprocess.Popen[bytes], limit_s: float = float("inf")) -> int:
@@ -21,8 +24,9 @@ def peak_kib(process: subprocess.Popen[bytes], limit_s: float = float("inf")) ->
     while process.poll() is None:
         if time.monotonic() > end:
             raise TimeoutError(f"over {limit_s:.0f} s")
+        began = time.perf_counter()
         peak = max(peak, sum(_share_of(pid) for pid in _family(process.pid)))
-        time.sleep(_EVERY_S)
+        time.sleep(max(_EVERY_S, (time.perf_counter() - began) / _MOST))
     return peak
 
 

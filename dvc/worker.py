@@ -137,7 +137,7 @@ class Worker(AbstractContextManager["Worker", None]):
                     watch()
 
             try:
-                future = self._submitted(executor, task, *args)
+                future = self._submitted(executor, _alone, task, *args)
                 return _result(future, watched)
             except (TerminatedWorkerError, ShutdownExecutorError) as died:
                 executor.shutdown(wait=False, kill_workers=True)
@@ -288,6 +288,13 @@ def _is_answered(executor: ProcessPoolExecutor) -> bool:
     """Whether loky's thread runs that takes the answers of the child process."""
     thread = executor._executor_manager_thread
     return thread is None or thread.is_alive()
+
+
+def _alone(task: Callable[..., _T], *args: Any) -> _T:
+    try:
+        return task(*args)
+    finally:
+        hand_memory_back()  # the next task, or the caller, may need it before this process ends
 
 
 def _imported(module: str) -> None:

@@ -113,8 +113,8 @@ def fit(
             coefficients = turned(axes.T, spline_through(guess, control))
         rest = None if start is None else turned(axes.T, spline_through(start, control))
         level = _level(pictures, inside, soft, core, control, sigma_mm, rest)
-        start_at = level.at(coefficients)
-        coefficients = level.descend(start_at, weights, steps=steps * weights.patience, stop_mm=stop_mm).coefficients
+        patience = weights.patience
+        coefficients = level.descend(coefficients, weights, steps=steps * patience, stop_mm=stop_mm).coefficients
         if parameters.volume is None and number == len(LEVELS) - 2:
             usual = replace(weights, bending=USUAL_BENDING)
             choice = replace(choice, asked=level.volume_asked(coefficients, usual, _LOOKING_MM4))
@@ -130,9 +130,10 @@ def fit(
         part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
         middle = Level(pictures, inside & part, soft & part, core & part, level.roughness, rest=rest)
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
+        del middle  # its memory goes to the last steps
         progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
     steps = _LAST_STEPS * choice.weights.patience
-    found = level.descend(level.at(coefficients), choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
+    found = level.descend(coefficients, choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
     progress(1.0)
     return BSpline(control, turned(axes, found.coefficients)), choice
 
@@ -155,7 +156,7 @@ def choose(
     def left_out(power: int) -> float:
         if power not in found:
             tried = replace(weights, **{name: usual * _RATIO**power})
-            found[power] = level.descend(start, tried, steps=1, stop_mm=0.0).images.left_out
+            found[power] = level.lower(start, tried)[0].images.left_out
         return found[power]
 
     def followed(best: int, way: int, enough: float = 0.0) -> int:

@@ -185,34 +185,37 @@ class Level:
     def _of_gradient(self) -> list[FloatArray]:
         return self.pair.blocks.own_blocks(volume=self._alone)
 
-    def descend(self, state: State, weights: Weights, *, steps: int, stop_mm: float) -> State:
+    def descend(self, coefficients: FloatArray, weights: Weights, *, steps: int, stop_mm: float) -> State:
         """Take at most so many `steps`; end once one moves soft tissue by less than `stop_mm` (rms), or none helps."""
+        state = self.at(coefficients)  # which nothing else holds: its memory goes to the states that follow
         for _ in range(steps):
-            variance, count = max(state.variance, _LEAST_RESIDUAL**2), state.images.count
-
-            def energy(at: State, variance: float = variance, count: int = count) -> float:
-                # with the mean over voxels, so that tissue that leaves the picture does not lower it
-                return 0.5 * count * at.variance / variance + self.prior(at, weights)
-
-            before = energy(state)
-            step = self.step(state, weights, variance, _SOLVER if state.halves < 0 else _SOLVER_OF_HALF)
-            if not np.isfinite(step).all():
-                raise RegistrationError(f"The registration diverged: a step is not finite. {_DIVERGED}")
-            moved = self.pair.blocks.evaluate(step)[0]
-            # Air, and tissue that no image shows, may go where it likes; tissue not where the energy then rises.
-            tissue = (self._soft > 0) | self._resists
-            seen, everywhere = (self._share(moved[w]) for w in (tissue & state.images.shown, tissue))
-            for share in (*(seen * 0.5**n for n in range(_HALVINGS)), min(everywhere, seen * 0.5**_HALVINGS)):
-                trial = self.at(state.coefficients + share * step, state.halves)
-                if energy(trial) <= before + _SLACK * abs(before):
-                    break
-            else:
-                break
-            state = trial
-            square = np.einsum("...a,...a->...", moved, moved)
-            if share * np.sqrt(dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)) < stop_mm:
+            state, moved_mm = self.lower(state, weights)
+            if moved_mm < stop_mm:
                 break
         return state
+
+    def lower(self, state: State, weights: Weights) -> tuple[State, float]:
+        """The state after one step, and how far it moved soft tissue (rms, mm): 0 where no step lowers the energy."""
+        variance, count = max(state.variance, _LEAST_RESIDUAL**2), state.images.count
+
+        def energy(at: State) -> float:
+            # with the mean over voxels, so that tissue that leaves the picture does not lower it
+            return 0.5 * count * at.variance / variance + self.prior(at, weights)
+
+        before = energy(state)
+        step = self.step(state, weights, variance, _SOLVER if state.halves < 0 else _SOLVER_OF_HALF)
+        if not np.isfinite(step).all():
+            raise RegistrationError(f"The registration diverged: a step is not finite. {_DIVERGED}")
+        moved = self.pair.blocks.evaluate(step)[0]
+        # Air, and tissue that no image shows, may go where it likes; tissue not where the energy then rises.
+        tissue = (self._soft > 0) | self._resists
+        seen, everywhere = (self._share(moved[w]) for w in (tissue & state.images.shown, tissue))
+        for share in (*(seen * 0.5**n for n in range(_HALVINGS)), min(everywhere, seen * 0.5**_HALVINGS)):
+            trial = self.at(state.coefficients + share * step, state.halves)
+            if energy(trial) <= before + _SLACK * abs(before):
+                square = np.einsum("...a,...a->...", moved, moved)
+                return trial, share * float(np.sqrt(dot(self._soft, square) / max(self._soft.sum(), _SMALLEST)))
+        return state, 0.0
 
     def _share(self, moved: FloatArray) -> float:
         """The share of a step, 1 at the most, by which no place moves so far that the step folds it by itself."""
@@ -230,7 +233,7 @@ class Level:
         seen = float(np.median(state.images.matrix[soft][:, [0, 3, 5]].mean(axis=1)))
         sharpness = seen / max(state.variance, _LEAST_RESIDUAL**2) / float(self._soft.max())
         looking = replace(weights, volume=0.0, volume_gradient=held_mm4 * sharpness)
-        freed = self.descend(state, looking, steps=1, stop_mm=0.0)
+        freed, _ = self.lower(state, looking)
         return float(np.percentile(np.abs(freed.J - 1.0)[soft], 99.0))
 
     def _unevenness(self, J: FloatArray) -> FloatArray:

@@ -64,8 +64,7 @@ def fit_with_interfaces(
     weights = replace(first.weights, rigidity=(skin or USUAL_SKIN) if stage.has_skin else 0.0)
     steps, stop_mm = _STEPS * weights.patience, LEVELS[-1][-1]
     coefficients: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
-    begun = stage.whole.at(coefficients)
-    coefficients = stage.whole.descend(begun, weights, steps=steps, stop_mm=stop_mm).coefficients
+    coefficients = stage.whole.descend(coefficients, weights, steps=steps, stop_mm=stop_mm).coefficients
     stage.whole.roughness = stage.slab.roughness = stage.whole.following(coefficients)
     progress(_SMOOTH_SHARE + 0.1)
     if skin is not None:
@@ -84,7 +83,8 @@ def fit_with_interfaces(
         choice, rule=rule, tried_in_skin=in_skin.tried, at_interfaces=True, asked=first.asked, in_bone=in_bone
     )
     progress(_SMOOTH_SHARE + 0.5)
-    found = stage.whole.descend(stage.whole.at(coefficients), choice.weights, steps=steps, stop_mm=stop_mm)
+    del stage.slab  # its memory goes to the last steps
+    found = stage.whole.descend(coefficients, choice.weights, steps=steps, stop_mm=stop_mm)
     progress(1.0)
     v, w = (BSpline(control, turned(axes, part)) for part in np.split(found.coefficients, 2))
     return InterfaceSpline(v, w, stage.interfaces), choice

@@ -93,10 +93,9 @@ class Residuals:
     def at(self, coefficients, halves):
         return None
 
-    def descend(self, state, weights, **_):
-        return SimpleNamespace(
-            images=SimpleNamespace(left_out=self._left[round(2.0 * np.log10(weights.rigidity / 3.0))])
-        )
+    def lower(self, state, weights):
+        left_out = self._left[round(2.0 * np.log10(weights.rigidity / 3.0))]
+        return SimpleNamespace(images=SimpleNamespace(left_out=left_out)), 0.0
 
 
 @pytest.mark.parametrize(

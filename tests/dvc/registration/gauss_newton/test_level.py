@@ -238,5 +238,5 @@ def test_a_step_is_not_cut_short_for_tissue_that_no_image_shows(monkeypatch):
     step = np.zeros((3, *level.control.shape))
     step[2, :, :, -3:] = 20.0
     monkeypatch.setattr(level, "step", lambda *_: step)
-    found = level.descend(level.at(0.0 * step), Weights(1e-9, 0.0, 0.0), steps=1, stop_mm=0.0)
+    found = level.descend(0.0 * step, Weights(1e-9, 0.0, 0.0), steps=1, stop_mm=0.0)
     np.testing.assert_array_equal(found.coefficients, step)
