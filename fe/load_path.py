@@ -18,6 +18,7 @@ from fe.mesh_file import SKIN
 from fe.newton import Imposed, Tolerance, equilibrium
 from fe.plate import Contact, ContactStatus, Parallel, Turning
 from fe.problem import PlateTarget, Problem
+from fe.published import doubts
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
@@ -26,6 +27,9 @@ _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
 _LEAST_APPROACH_MM = 0.01
+# Least steps with a material whose stiffness is odd or whose stress falls, a fraction and mm: where these fail, smaller
+# ones and viscous descent took minutes to fail as well.
+_LEAST_DOUBTED, _LEAST_APPROACH_DOUBTED_MM = 1.0 / 32.0, 0.1
 _ALONG_NORMAL = np.array([True, False, False])
 # Fraction of the normal load up to which the plate is displacement controlled, so that nodes touch it in order. A plate
 # that rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
@@ -92,6 +96,7 @@ class LoadPath:
         self.plate = PlateState(self._start_mm, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
         self.curve = [self.plate]
         self.iterations = 0
+        self._doubted = bool(doubts("", problem.materials))
 
     def reached(self, target: PlateTarget) -> FloatArray:
         """Current values (3,) of the quantities that a target prescribes."""
@@ -146,7 +151,7 @@ class LoadPath:
         way = target.values - before  # displacement steps are small, so that nodes come into contact in order
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, first, False
-        least = min(_LEAST_STEP, 0.01 * largest)
+        least = _LEAST_DOUBTED if self._doubted else min(_LEAST_STEP, 0.01 * largest)
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
             step = min(step, largest)
             share = min(1.0, done + step)
@@ -156,7 +161,7 @@ class LoadPath:
                 self.on_converged()
                 continue
             step *= _SHRINK
-            stays = self.contact.plate.taped and not self.contact.status.turns
+            stays = self.contact.plate.taped and not self.contact.status.turns and not self._doubted
             # if Newton's method fails under force control, viscous descent takes over
             if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
                 downhill, step = True, _DOWNHILL_STEP
@@ -166,8 +171,9 @@ class LoadPath:
         """Move the plate along its normal until its force is ``enough_n`` or cannot rise; never above ``most_n``."""
         farthest = self.plate.displacement_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
         largest, exact = _MOST_APPROACH_MM, self.tolerance
+        least = _LEAST_APPROACH_DOUBTED_MM if self._doubted else _LEAST_APPROACH_MM
         rough = replace(exact, force=_ROUGH_FORCE * exact.force, step_mm=_ROUGH_STEP * exact.step_mm)
-        while self.plate.force_n[0] < enough_n and largest > _LEAST_APPROACH_MM and not self.is_over():
+        while self.plate.force_n[0] < enough_n and largest > least and not self.is_over():
             step = min(largest, self._to_next_stop(), self._to_force(_AIM * most_n))
             if farthest - self.plate.displacement_mm[0] < step:
                 break

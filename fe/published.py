@@ -75,7 +75,7 @@ class MaterialSet:
         by_region, notes = dict[str, Material](), list[str]()
         if WHOLE in self.materials:
             by_region = dict.fromkeys(regions, self.materials[WHOLE])
-            return by_region, tuple(_odd(self.name, by_region))
+            return by_region, tuple(doubts(self.name, by_region))
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
@@ -90,10 +90,10 @@ class MaterialSet:
             by_region[region] = known[name.casefold()]
             if name != region:
                 notes.append(f"{self.name} has no material for {region}; that of {name} is used.")
-        return by_region, (*notes, *_odd(self.name, by_region))
+        return by_region, (*notes, *doubts(self.name, by_region))
 
 
-def _odd(name: str, materials: Materials) -> list[str]:
+def doubts(name: str, materials: Materials) -> list[str]:
     """Sentences on materials whose stiffness is odd, and on those whose stress falls at strains of use."""
     return [*_odd_stiffness(name, materials), *_falling(name, materials)]
 

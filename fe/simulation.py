@@ -131,7 +131,7 @@ class Simulation:
                 when = began if len(state.curve) > 1 else "before the first equilibrium"
                 notes.append(f"{state.load.name}: the time limit was reached {when}.")
         notes += [
-            f"{state.load.name}: no equilibrium was found beyond {state.reached:.0%} of the load, even in the smallest"
+            f"{state.load.name}: no equilibrium was found beyond {state.reached:.0%} of the load, even in small"
             f" steps; {'cells nearly folded' if (least := self._least_volume(state)) < CROWDED else 'tissue gave way'} "
             f"(lowest det F {least:.2f}). Lower the load, or check its unit and the material parameters."
             for state in self.states

@@ -1,7 +1,7 @@
 """What cannot reach equilibrium ends with its cause, after a limited number of steps.
 
 A step is one linear solution. Processor time is looked at too, so that "within a minute" is more than a number of
-steps; it was 4 s at most.
+steps; it was 2 s at most.
 """
 
 import re
@@ -15,6 +15,7 @@ from fe.linear import Solver
 from tests.fe.test_simulate import ALONG, DOWN, FAT, SKIN, dome
 
 MOST_STEPS, MINUTE = 1000, 60.0
+DOUBTED_STEPS = 250  # with a material that is told to be odd, for which smaller steps and viscous descent are not tried
 FALLING = Yeoh.of(0.03, c20_mpa=-0.02)
 SOFT = NeoHooke.of(1e-5)  # 10 Pa
 TOLD = "no equilibrium was found beyond"
@@ -40,17 +41,17 @@ class Counted:
 
 
 @pytest.mark.parametrize(
-    ("skin", "fat", "load", "cause"),
+    ("skin", "fat", "load", "cause", "most"),
     [
-        (FALLING, FAT, LoadStep("a", 40.0), "softens until its stress falls"),
-        (Yeoh.of(0.01, c20_mpa=-0.1), FAT, LoadStep("a", 40.0, 10.0), "softens until its stress falls"),
-        (SKIN, SOFT, LoadStep("a", 2.0), r"shear modulus of 0.01 kPa, .* Are they in MPa, entered as kPa\?"),
-        (SKIN, FAT, LoadStep("a", 2.0, 300.0), "nearly folded"),
+        (FALLING, FAT, LoadStep("a", 40.0), "softens until its stress falls", DOUBTED_STEPS),
+        (Yeoh.of(0.01, c20_mpa=-0.1), FAT, LoadStep("a", 40.0, 10.0), "softens until its stress falls", DOUBTED_STEPS),
+        (SKIN, SOFT, LoadStep("a", 2.0), r"modulus of 0.01 kPa, .* Are they in MPa, entered as kPa\?", DOUBTED_STEPS),
+        (SKIN, FAT, LoadStep("a", 2.0, 300.0), "nearly folded", MOST_STEPS),
     ],
     ids=["falling skin", "falling steeply", "fat of 10 Pa", "sheared too far"],
 )
 def test_it_ends_within_a_minute_with_its_cause(
-    skin: Material, fat: Material, load: LoadStep, cause: str, monkeypatch: pytest.MonkeyPatch
+    skin: Material, fat: Material, load: LoadStep, cause: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counted = Counted(monkeypatch)
     done = counted.of({"skin": skin, "fat": fat}, load)
@@ -59,7 +60,7 @@ def test_it_ends_within_a_minute_with_its_cause(
     notes = " ".join(done.notes)
     assert f"a: {TOLD}" in notes
     assert re.search(cause, notes)
-    assert counted.steps < MOST_STEPS
+    assert counted.steps < most
     assert counted.seconds < MINUTE
 
 
