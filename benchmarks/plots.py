@@ -189,16 +189,10 @@ def elements() -> Figure:
         axes[0].bar_label(bar, [told], fontsize=7)
     axes[0].set(ylabel="one lift, s", ylim=(0, 80))
     axes[0].set_xticks(range(len(programs)), programs.values(), fontsize=6)
-    for file, name in (("fe_scaling", "one set of meshes"), ("fe_scaling_320k", "another")):
-        scaling = read(file)
-        colour = OURS if file == "fe_scaling" else LABELS
-        for one, key, label in zip(axes[1:], ("load_s", "peak_gib"), ("Load1, s", "memory, GiB"), strict=True):
-            thousands = np.array(scaling["cells"]) / 1000.0
-            one.plot(thousands, scaling["least"][key], MARKERS[colour], color=colour, label=name)
-            one.set(xlabel="thousand cells", ylabel=label)
-    for one in axes[1:]:
-        one.set(xlim=(0, None), ylim=(0, None))
-    axes[1].legend(fontsize=8)
+    scaling = read("fe_scaling")
+    for one, key, label in zip(axes[1:], ("load_s", "peak_gib"), ("Load1, s", "memory, GiB"), strict=True):
+        one.plot(np.array(scaling["cells"]) / 1000.0, scaling["least"][key], MARKERS[OURS], color=OURS)
+        one.set(xlabel="thousand cells", ylabel=label, xlim=(0, None), ylim=(0, None))
     return figure
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -22,8 +23,9 @@ from dvc.io.transforms.write import write_elastix_transform
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.engine import GaussNewton
+from dvc.registration.gauss_newton.first_run import _tiny_pair
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME, _level, choose, control_grid, fit, spline_through
-from dvc.registration.gauss_newton.level import Level, Weights
+from dvc.registration.gauss_newton.level import Level, State, Weights
 from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 from dvc.registration.register import Settings, register
@@ -82,6 +84,19 @@ def test_what_bends_is_smoothed_less_than_what_does_not():
 
     assert 0.3 < chosen(1.0) < 5.0  # found to 0.12 mm root mean square at 0.45, to 0.17 at 3 and 0.15 at 0.1
     assert chosen(0.0) > 20.0  # found to 0.03 mm at 30, to 0.08 at 1
+
+
+def test_levels_and_states_that_are_done_with_are_let_go(monkeypatch):
+    held, lower = [], Level.lower
+
+    def counted(level: Level, state: State, weights: Weights):
+        held.append([sum(isinstance(one, kind) for one in gc.get_objects()) for kind in (Level, State)])
+        return lower(level, state, weights)
+
+    monkeypatch.setattr(Level, "lower", counted)
+    for engine in (fit, fit_with_interfaces):
+        engine(_tiny_pair(), GaussNewton())
+        assert held[-1] == [1, 1]  # in the last step, which needs most memory: of the step before it would be two
 
 
 class Residuals:
