@@ -31,7 +31,8 @@ def timed(tree: Path, *arguments: str) -> dict[str, float]:
     environment = os.environ | {"PYTHONPATH": str(tree)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed copy holds the bytecode of its modules
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "mrstrain", *arguments], env=environment)
+    # in the tree: the folder in which Python starts comes before PYTHONPATH
+    process = subprocess.Popen([sys.executable, "-m", "mrstrain", *arguments], env=environment, cwd=tree)
     peak = peak_kib(process)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
@@ -53,14 +54,15 @@ def main() -> None:
     tree = given.tree.resolve()
     if given.work.exists() and any(given.work.iterdir()):
         parser.error(f"{given.work} is not empty: the first run has to begin from nothing")
-    demo = ["demo", "--out", str(given.work), *(["--full"] if given.full else [])]
+    work = given.work.resolve()
+    demo = ["demo", "--out", str(work), *(["--full"] if given.full else [])]
     runs = {}
     if given.study:
-        runs["phantom"] = timed(tree, "phantom", "--seed", "1", "--out", str(given.work))
-        (given.work / "study.toml").write_text(given.study.read_text(encoding="utf-8"), encoding="utf-8")
+        runs["phantom"] = timed(tree, "phantom", "--seed", "1", "--out", str(work))
+        (work / "study.toml").write_text(given.study.read_text(encoding="utf-8"), encoding="utf-8")
     runs["from images" if given.study else "from nothing"] = timed(tree, *demo)
     runs["again"] = timed(tree, *demo)
-    runs["report alone"] = timed(tree, "run", str(given.work), "--report-only")
+    runs["report alone"] = timed(tree, "run", str(work), "--report-only")
     results = {"versions": versions(), "cores": len(os.sched_getaffinity(0)), "full": given.full, "runs": runs}
     given.out.write_text(json.dumps(results, indent=1) + "\n")
     for name, told in runs.items():

@@ -62,8 +62,8 @@ def is_lack_of_memory(failure: BaseException | None) -> bool:
 
 def hand_memory_back() -> None:
     """Give freed memory, which glibc keeps for what comes next, back to the system: after a task that needed much."""
-    gc.collect()
-    with suppress(OSError, AttributeError, TypeError):  # another C library
+    with suppress(OSError, AttributeError, TypeError, MemoryError):  # another C library, or no memory even for this
+        gc.collect()
         ctypes.CDLL(None).malloc_trim(0)
 
 

@@ -27,9 +27,9 @@ _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
 _LEAST_APPROACH_MM = 0.01
-# Least steps with a material whose stiffness is odd or whose stress falls, a fraction and mm: where these fail, smaller
-# ones and viscous descent took minutes to fail as well.
-_LEAST_DOUBTED, _LEAST_APPROACH_DOUBTED_MM = 1.0 / 32.0, 0.1
+# With a material whose stiffness is far from every published one, or whose stress falls, and below this fraction of the
+# normal load: least steps, of a stage and mm. Where they fail, smaller ones and viscous descent took minutes to fail.
+_EARLY, _LEAST_DOUBTED, _LEAST_DOUBTED_MM = 0.5, 1.0 / 32.0, 0.1
 _ALONG_NORMAL = np.array([True, False, False])
 # Fraction of the normal load up to which the plate is displacement controlled, so that nodes touch it in order. A plate
 # that rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
@@ -151,7 +151,7 @@ class LoadPath:
         way = target.values - before  # displacement steps are small, so that nodes come into contact in order
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, first, False
-        least = _LEAST_DOUBTED if self._doubted else min(_LEAST_STEP, 0.01 * largest)
+        least = min(_LEAST_STEP, 0.01 * largest)
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
             step = min(step, largest)
             share = min(1.0, done + step)
@@ -161,7 +161,9 @@ class LoadPath:
                 self.on_converged()
                 continue
             step *= _SHRINK
-            stays = self.contact.plate.taped and not self.contact.status.turns and not self._doubted
+            if self._hopeless(self.reached(target)[0], target.values[0]) and step < min(_LEAST_DOUBTED, 0.15 * largest):
+                break
+            stays = self.contact.plate.taped and not self.contact.status.turns
             # if Newton's method fails under force control, viscous descent takes over
             if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
                 downhill, step = True, _DOWNHILL_STEP
@@ -171,20 +173,26 @@ class LoadPath:
         """Move the plate along its normal until its force is ``enough_n`` or cannot rise; never above ``most_n``."""
         farthest = self.plate.displacement_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
         largest, exact = _MOST_APPROACH_MM, self.tolerance
-        least = _LEAST_APPROACH_DOUBTED_MM if self._doubted else _LEAST_APPROACH_MM
         rough = replace(exact, force=_ROUGH_FORCE * exact.force, step_mm=_ROUGH_STEP * exact.step_mm)
-        while self.plate.force_n[0] < enough_n and largest > least and not self.is_over():
+        while self.plate.force_n[0] < enough_n and largest > _LEAST_APPROACH_MM and not self.is_over():
             step = min(largest, self._to_next_stop(), self._to_force(_AIM * most_n))
             if farthest - self.plate.displacement_mm[0] < step:
                 break
             last = self.increment
             aim = np.array([self.plate.displacement_mm[0] + step, 0.0, 0.0])
-            if self._go(_ALONG_NORMAL, aim, tolerance=rough) and self.plate.force_n[0] < most_n:
+            converged = self._go(_ALONG_NORMAL, aim, tolerance=rough)
+            if converged and self.plate.force_n[0] < most_n:
                 self._log("moved")
                 self.on_converged()
-            else:
-                self._back(last)
-                largest = _SHRINK * step
+                continue
+            self._back(last)
+            largest = _SHRINK * step
+            if not converged and largest < _LEAST_DOUBTED_MM and self._hopeless(self.plate.force_n[0], most_n):
+                break
+
+    def _hopeless(self, reached: float, normal: float) -> bool:
+        """Whether no smaller step is tried after one that failed: far from the normal load, with a doubted material."""
+        return self._doubted and reached < _EARLY * normal
 
     def _to_force(self, force_n: float) -> float:
         """Step of the approach to a force, mm, if the force goes on to grow by the same factor with each mm."""

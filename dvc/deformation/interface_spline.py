@@ -24,6 +24,7 @@ from dvc.images.interpolation import indices_around, spline_basis
 from dvc.threads import in_parts
 
 _GAP_MM = 3.0  # from a tissue: what has no label there belongs to it
+_PLANES = 16  # of voxels whose factors are computed at once
 NUMBERS = OF_DEPTH | {"gap_mm": _GAP_MM}
 """Every number that determines the position of an interface, for a record."""
 
@@ -93,15 +94,20 @@ class Interfaces:
 
         On a border the gradient is that of the voxel's own side.
         """
-        depth, slope = np.zeros(self.grid.shape), np.zeros((*self.grid.shape, 3))
-        for number in range(len(self.depth)):
-            mine = self.own == number
-            depth[mine], slope[mine] = self._at_voxels(number, mine)
-        away, toward = np.full(depth.shape, np.inf), np.zeros_like(slope)
-        if self.rest >= 0:
-            bone, into = self._at_voxels(self.rest, np.ones(self.grid.shape, dtype=bool))
-            away, toward = -bone.reshape(depth.shape), -into.reshape(slope.shape)
-        return self._factors(depth, slope, away, toward, self.own)
+        out = np.empty((*self.grid.shape, 2, 4))
+        for start in range(0, len(out), _PLANES):  # of all at once, depths and slopes would take twice as much as these
+            planes = slice(start, start + _PLANES)
+            own = self.own[planes]
+            depth, slope = np.zeros(own.shape), np.zeros((*own.shape, 3))
+            for number in range(len(self.depth)):
+                mine = own == number
+                depth[mine], slope[mine] = self._at_voxels(number, mine, start)
+            away, toward = np.full(own.shape, np.inf), np.zeros_like(slope)
+            if self.rest >= 0:
+                bone, into = self._at_voxels(self.rest, np.ones(own.shape, dtype=bool), start)
+                away, toward = -bone.reshape(own.shape), -into.reshape(slope.shape)
+            out[planes] = self._factors(depth, slope, away, toward, own)
+        return out
 
     def at(self, points_mm: FloatArray, gradient: bool = True) -> FloatArray:
         """Factors at points (n, 3) LPS mm, (n, 2, 4): value and gradient in LPS, or (n, 2, 1) without the gradient."""
@@ -147,9 +153,9 @@ class Interfaces:
             out[own == self.rest] = 0.0
         return out
 
-    def _at_voxels(self, number: int, where: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Depth (n,) in a tissue at voxels, mm, and its gradient (n, 3) along the grid's axes."""
-        indices = np.argwhere(where).astype(np.float64)
+    def _at_voxels(self, number: int, where: BoolArray, start: int) -> tuple[FloatArray, FloatArray]:
+        """Depth (n,) in a tissue, mm, at voxels of planes from ``start``; its gradient (n, 3) along the grid's axes."""
+        indices = np.argwhere(where) + np.array([float(start), 0.0, 0.0])
         depth, per_voxel = evaluate_spline(self.depth[number : number + 1], indices, mirror=True)
         return depth[:, 0], per_voxel[:, 0] / self.grid.spacing_mm
 

@@ -79,3 +79,11 @@ def test_what_no_tissue_can_is_refused_before_the_first_step(
     with pytest.raises(InputError, match=cause):
         counted.of(laws, load)
     assert not counted.steps
+
+
+def test_a_doubted_material_that_can_reach_its_load_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = Counted(monkeypatch)
+    stiff = NeoHooke.of(30.0)  # fat of 30 MPa: kPa entered as MPa
+    done = counted.of({"skin": SKIN, "fat": stiff}, LoadStep("a", 2.0, 1.0))
+    assert "Are its parameters in kPa, entered as MPa?" in " ".join(done.notes)
+    assert done.complete

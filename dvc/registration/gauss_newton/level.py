@@ -190,7 +190,7 @@ class Level:
         state = self.at(coefficients)  # which nothing else holds: its memory goes to the states that follow
         for _ in range(steps):
             state, moved_mm = self.lower(state, weights)
-            if moved_mm < stop_mm:
+            if not moved_mm or moved_mm < stop_mm:
                 break
         return state
 
@@ -215,6 +215,7 @@ class Level:
             if energy(trial) <= before + _SLACK * abs(before):
                 square = np.einsum("...a,...a->...", moved, moved)
                 return trial, share * float(np.sqrt(dot(self._soft, square) / max(self._soft.sum(), _SMALLEST)))
+            del trial  # its memory goes to the next
         return state, 0.0
 
     def _share(self, moved: FloatArray) -> float:
