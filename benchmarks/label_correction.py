@@ -1,11 +1,13 @@
 """Strain measured with label maps whose borders are wrong, and with the same corrected by the image.
 
     python -m benchmarks.label_correction --seeds 51 52 --out benchmarks/results/label_correction.json
+    python -m benchmarks.label_correction --boundaries --seeds 3 4 --out benchmarks/results/label_boundaries.json
 
 Heels at 0.8 mm and SNR 25. The borders of bones and skin are exact, a voxel too large or too small all around, wrong by
 a voxel in patches of 5 mm at random, or wrong by a smooth error of up to 1.5 voxels; each is given to the registration
 as it is, and after `correct_labels`. Root mean square errors of the max. shear by the tissues of the label map that the
-registration was given, and share of its labels that are wrong.
+registration was given, and share of its labels that are wrong. With ``--boundaries`` nothing is registered: told is how
+far corrected boundaries of bones and skin are off, mm, at several noise levels.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import argparse
 import json
 from contextlib import nullcontext
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +24,11 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from dvc import Image, LabelMap, Mask, correct_labels
 from dvc.arrays import FloatArray
+from dvc.images.depth import depth_mm
 from dvc.threads import usable_cores
 from dvc.worker import Worker
 from mrstrain.records.provenance import versions
-from phantoms import AccuracyCase, Heel, error_rows, heel_grid, labels_of, measure_run, misdrawn
+from phantoms import AccuracyCase, Heel, error_rows, heel_grid, labels_of, measure_run, misdrawn, scan
 
 ENGINE, SPACING, SNR = "gauss-newton-borders", (0.8, 0.8, 0.8), 25.0
 MOTIONS = ("smooth", "sliding", "Load1", "Load3")
@@ -83,14 +87,38 @@ def measured(seed: int, motion: str, how: str, corrected: bool, worker: Worker) 
     return {**about, "wrong": float(wrong[0]), "errors": of}
 
 
+def off_by(seed: int, snr: float | None, how: str) -> dict[str, object]:
+    """Mean and root mean square of how far corrected boundaries are off, mm; above zero where a tissue is too thick."""
+    heel, grid = Heel(seed), heel_grid(SPACING)
+    truth = labels_of(heel, grid)
+    found = correct_labels(scan(heel, grid, snr=snr, number=0), drawn(truth, how, seed)).labels.labels
+    number = {name: value for value, name in truth.names.items()}
+    row: dict[str, object] = {"seed": seed, "snr": snr, "labels": how}
+    row["wrong"] = float(np.mean(found[truth.labels > 0] != truth.labels[truth.labels > 0]))
+    for tissue, names in (("bones", ("bone", "ankle")), ("skin", ("skin",))):
+        those = [number[name] for name in names]
+        is_right, is_found = (np.isin(of, those) | ((of == 0) & (tissue == "skin")) for of in (truth.labels, found))
+        right = depth_mm(is_right, grid.spacing_mm)
+        off = (depth_mm(is_found, grid.spacing_mm) - right)[np.abs(right) < 0.5 * SPACING[0]]
+        row[tissue] = [round(float(off.mean()), 3), round(float(np.sqrt((off**2).mean())), 3)]
+    return row
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--labels", nargs="+", default=["exact", "large", "small", "patches", "smooth"])
     parser.add_argument("--motions", nargs="+", default=MOTIONS)
+    parser.add_argument("--boundaries", action="store_true", help="how far they are off, without a registration")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     rows = []
+    if given.boundaries:
+        for seed, snr, how in product(given.seeds, (SNR, 60.0, None), ("exact", "large", "small")):
+            rows.append(off_by(seed, snr, how))
+            print(rows[-1], flush=True)
+        given.out.write_text(json.dumps({"versions": versions(), "rows": rows}, indent=1) + "\n")
+        return
     for seed in given.seeds:
         for motion in given.motions:
             for how in given.labels:

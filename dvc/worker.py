@@ -137,7 +137,7 @@ class Worker(AbstractContextManager["Worker", None]):
                     watch()
 
             try:
-                future = self._submitted(executor, _alone, task, *args)
+                future = self._submitted(executor, _then_hand_back, task, *args)
                 return _result(future, watched)
             except (TerminatedWorkerError, ShutdownExecutorError) as died:
                 executor.shutdown(wait=False, kill_workers=True)
@@ -290,11 +290,12 @@ def _is_answered(executor: ProcessPoolExecutor) -> bool:
     return thread is None or thread.is_alive()
 
 
-def _alone(task: Callable[..., _T], *args: Any) -> _T:
+def _then_hand_back(task: Callable[..., _T], *args: Any) -> _T:
+    """A task, and then its freed memory: the next task, or the caller, may need it while this process still lives."""
     try:
         return task(*args)
     finally:
-        hand_memory_back()  # the next task, or the caller, may need it before this process ends
+        hand_memory_back()
 
 
 def _imported(module: str) -> None:

@@ -96,6 +96,25 @@ def test_freed_memory_goes_back_to_the_system_between_tasks():
     assert last[0] == 1.0
 
 
+def _resident(needed: int) -> int:
+    """Resident memory once so many small arrays are freed, all but the last, which lies above the others."""
+    blocks = [np.ones(12_000) for _ in range(needed)]
+    if blocks:
+        _KEPT.append(blocks.pop())
+        blocks.clear()
+    return int(psutil.Process().memory_info().rss)
+
+
+_KEPT: list[np.ndarray] = []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_a_worker_gives_the_freed_memory_of_a_task_back_before_the_next():
+    with Worker(threads=1) as worker:
+        at_its_end = worker.run("counting", _resident, 2_000)  # 192 MB
+        assert at_its_end - worker.run("counting", _resident, 0) > 150e6
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
 def test_memory_that_runs_out_is_named_and_the_next_task_runs():
     with Worker(threads=1) as worker:
