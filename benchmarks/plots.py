@@ -41,6 +41,14 @@ PEERS = {
     "elastix default, as acquired": "elastix, defaults",
 }  # fmt: skip
 SETS = ("trebbi", "zwam", "erdemir", "luboz")
+MOTIONS = {
+    "trebbi": "material set trebbi", "akrami": "material set akrami", "stiff-skin": "stiff skin",
+    "soft-skin": "soft skin", "stiff-fat": "stiff fat", "stiff-muscle": "stiff muscle", "lobules": "fat in lobules",
+    "lobules at 1.2 mm": "the same, 1.2 mm", "slipping": "plate without tape", "loads": "Load3 (seen)",
+    "sliding": "sliding pad (seen)",
+}  # fmt: skip
+SEEN = ("loads", "sliding")
+"""Motions of the accuracy study itself; all others are of finite-element models."""
 
 
 def read(name: str) -> Any:
@@ -57,7 +65,7 @@ def panels(count: int = 1, height: float = 3.2) -> tuple[Figure, list[Axes]]:
 
 
 def peers() -> Figure:
-    """Error of every program by tissue, means of the pairs set aside."""
+    """Error of every program by tissue, means of the held-out pairs."""
     runs = [run for run in read("peers")["runs"] if run["status"] == "done"]
     errors = {
         peer: [mean(run["tissues"][t]["shear_rmse"] for run in runs if run["peer"] == peer) for t in TISSUES]
@@ -96,7 +104,7 @@ def error() -> Figure:
 
 
 def engines() -> Figure:
-    """Error of each engine under every motion: in fat, in fat beside bone, and in skin; labels are right."""
+    """Error of each engine under every motion: in fat, in fat beside bone, and in skin; labels are correct."""
     figure, axes = panels(3)
     motions = ("smooth", "sliding", "Load1", "Load3")
     shown: dict[str, tuple[str, float | None]] = {
@@ -136,6 +144,29 @@ def resolution() -> Figure:
     return figure
 
 
+def coverage() -> Figure:
+    """Voxels that the error bars cover, by tissue and motion, with and without a label map."""
+    told = read("unforeseen")
+    columns = {"fat": "fat", "muscle": "muscle", "skin": "skin", "near bone": "within 3 mm of bone"}
+    engines = (("gauss-newton-borders", "with a label map", 0.14), ("gauss-newton", "without", -0.14))
+    figure, axes = panels(len(columns), 3.6)
+    rows = list(reversed(MOTIONS))
+    seen = [place for place, motion in enumerate(rows) if motion in SEEN]
+    for one, (column, title) in zip(axes, columns.items(), strict=True):
+        one.axhspan(min(seen) - 0.5, max(seen) + 0.5, color=OTHERS, alpha=0.15, linewidth=0)
+        one.axvline(95, color="k", linewidth=0.6, linestyle=":")
+        for engine, label, up in engines:
+            colour = ENGINES[engine][1]
+            shares = [100.0 * told[engine][motion][column] for motion in rows]
+            one.plot(shares, np.arange(len(rows)) + up, MARKERS[colour][0], color=colour, label=label, markersize=5)
+        one.grid(visible=False)
+        one.set(title=title, xlim=(80, 101), xticks=(80, 90, 95, 100))
+        one.set_yticks(range(len(rows)), [MOTIONS[m] for m in rows] if column == "fat" else [], fontsize=8)
+    axes[1].legend(fontsize=7, loc="upper left")
+    figure.supxlabel("voxels whose true strain lies within 1.96 standard uncertainties, %", fontsize=9)
+    return figure
+
+
 def areas() -> Figure:
     """Area between strain-volume curves of a heel with a hidden model: true, and as a study estimates it."""
     told = read("hidden_law")
@@ -172,7 +203,7 @@ def registration() -> Figure:
 
 
 def elements() -> Figure:
-    """The solver: a lift of the sole beside FEBio and CalculiX, and time and memory over the number of cells."""
+    """The solver: one displacement of the sole by FEBio and CalculiX too; time and memory over the number of cells."""
     figure, axes = panels(3)
     runs = read("fe_speed")["runs"]
     programs = {
@@ -187,7 +218,7 @@ def elements() -> Figure:
         force = [run["force_n"] for run in runs if run["program"] == program and run["seconds"]]
         told = f"{height:.0f} s\n{force[0]:.0f} N" if seconds else "no result"
         axes[0].bar_label(bar, [told], fontsize=7)
-    axes[0].set(ylabel="one lift, s", ylim=(0, 80))
+    axes[0].set(ylabel="one prescribed displacement, s", ylim=(0, 80))
     axes[0].set_xticks(range(len(programs)), programs.values(), fontsize=6)
     scaling = read("fe_scaling")
     for one, key, label in zip(axes[1:], ("load_s", "peak_gib"), ("Load1, s", "memory, GiB"), strict=True):
@@ -212,7 +243,7 @@ def convergence() -> Figure:
     return figure
 
 
-PLOTS = (peers, error, engines, resolution, areas, registration, elements, convergence)
+PLOTS = (peers, error, engines, resolution, coverage, areas, registration, elements, convergence)
 
 
 def main() -> None:

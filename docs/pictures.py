@@ -4,7 +4,11 @@
     python -m pytest tests/test_tutorials.py -o tmp_path_retention_policy=all --basetemp=TUTORIALS
     PYTHONPATH=. python docs/pictures.py DEMO TUTORIALS
 
-Pictures of the gallery are made by its examples (docs/gallery.md), those of the benchmarks by benchmarks/plots.py.
+Pictures of the benchmarks are made by benchmarks/plots.py, those of the gallery by its examples:
+
+    mkdir -p out && cd out
+    for example in ../docs/gallery/*.py; do ../.venv/bin/python "$example"; done
+    mv *.webp ../docs/images/gallery
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""Strain inside soft tissue from pairs of MR images, and how far a finite-element model of it may be trusted.
+"""Strain inside soft tissue from pairs of MR images, and the comparison of finite-element models with it.
 
 The commands as functions: each takes paths and writes a folder. For arrays see `dvc`, `fe`, `validate` and `phantoms`.
 Importing it loads none of them: a function loads what it needs when it is first used.

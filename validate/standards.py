@@ -1,4 +1,4 @@
-"""The section of a report by the standards: image decomposition (CWA 16799) and modified area validation metric."""
+"""The section of a report on standard metrics: image decomposition (CWA 16799), modified area validation metric."""
 
 from collections.abc import Mapping, Sequence
 
@@ -70,7 +70,7 @@ def section(one: LoadComparison, picture: Picture | None) -> Section:
     """The folded section of one load, the answer first."""
     tables = (*((_representations(one),) if one.decompositions else ()), _model_forms(one))
     pictures = () if picture is None else (picture,)
-    return Section(f"{one.load}, by the standards", None, tables, pictures, answer(one), folded=True)
+    return Section(f"{one.load}, standard metrics (CWA 16799, MAVM)", None, tables, pictures, answer(one), folded=True)
 
 
 def answer(one: LoadComparison) -> tuple[str, ...]:
@@ -85,12 +85,13 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
     rows = {r.model: r for r in one.representations if r.tissue == tissue}
     best, nothing = rows[names[0]], rows[NOTHING]
     return (
-        f"{best.model}: the probability of representation in {tissue} is {best.probability:.0%}, weighted by the size "
-        f"of the errors (coefficients within their uncertainty: {best.in_band} of {best.coefficients}); for no "
-        f"deformation it is {nothing.probability:.0%}.",
+        f"In {tissue}, the probability of representation is {100.0 * best.probability:.0f} % for {best.model} and "
+        f"{100.0 * nothing.probability:.0f} % for no deformation. It is weighted by the size of the errors: "
+        f"{best.in_band} of the {best.coefficients} coefficients of {best.model} lie within their uncertainty.",
         _accepted(best),
         f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "
-        f"{best.guide_probability:.0%} for {best.model} and {nothing.guide_probability:.0%} for no deformation. "
+        f"{100.0 * best.guide_probability:.0f} % for {best.model} and {100.0 * nothing.guide_probability:.0f} % for no "
+        "deformation. "
         "In three dimensions this band is wider than most coefficients, so the first probability, "
         "with an uncertainty for each coefficient, is more informative.",
     )

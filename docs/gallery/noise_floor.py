@@ -13,7 +13,7 @@ repeat = dvc.measure(pair.reference, pair.repeat, bone=pair.bone, settings=setti
 soft = (pair.labels.labels > 0) & ~pair.bone.inside & repeat.maps.valid
 loaded = dvc.strain_maps(pair.deformation, dvc.Mask(pair.reference.grid, soft))
 floor, strained = (np.median(max_shear[soft]) for max_shear in (repeat.max_shear, loaded.max_shear))
-print(f"max. shear in the median: {floor:.3f} without load, {strained:.3f} under load")
+print(f"median max. shear: {floor:.3f} without load, {strained:.3f} under load")
 assert floor < 0.03 < strained
 
 plt.style.use(dvc.FIGURE_STYLE)

@@ -13,7 +13,7 @@ print(measured)
 fat = pair.labels.region("fat").inside & measured.maps.valid
 true = dvc.strain_maps(pair.deformation, dvc.Mask(pair.reference.grid, fat)).max_shear
 error = np.sqrt(np.mean((measured.max_shear - true)[fat] ** 2))
-print(f"max. shear in fat: {np.median(measured.max_shear[fat]):.3f} in the median, error {error:.3f}")
+print(f"median max. shear in fat: {np.median(measured.max_shear[fat]):.3f}, error {error:.3f}")
 assert error < 0.06
 
 measured.plot("max_shear", largest=0.4).savefig("strain_map.webp", dpi=70)

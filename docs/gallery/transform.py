@@ -6,7 +6,7 @@ import SimpleITK as sitk
 
 import dvc
 
-spline = sitk.BSplineTransform(3, 3)  # stands for your own file: transform.tfm, .h5, or TransformParameters.0.txt
+spline = sitk.BSplineTransform(3, 3)  # stands for your own: .tfm, .h5, or the last TransformParameters.*.txt
 spline.SetTransformDomainPhysicalDimensions((40.0, 40.0, 40.0))
 spline.SetTransformDomainMeshSize((5, 5, 5))
 spline.SetParameters(np.random.default_rng(1).normal(0.0, 1.0, len(spline.GetParameters())))

@@ -252,7 +252,7 @@ class Measurement:
             return f"no maximum shear strain; {self.verdict.words}"
         most = max(rows, key=lambda r: r.median * r.volume_ml)
         strain = f"{most.median:z.3f} median, {most.p95:z.3f} at the 95th percentile"
-        return f"max. shear strain in {most.region} {strain}; {self.verdict.words}"
+        return f"max. shear in {most.region} {strain}; {self.verdict.words}"
 
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, in lines."""

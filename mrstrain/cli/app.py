@@ -84,7 +84,7 @@ def doctor() -> None:
     tried = {"itk-elastix": "dvc.registration.elastix.run", "pytetwild": "fe.meshing", "sparse solver": "fe.linear"}
     findings = examine(trials={what: partial(trial, what, module) for what, module in tried.items()})
     for finding in findings:
-        say(f"{'ok  ' if finding.ok else 'NOT '} {finding.what}: {finding.detail}")
+        say(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}")
         if not finding.ok and finding.advice:
             say(f"     {finding.advice}")
     if not all(f.ok for f in findings):
@@ -122,7 +122,7 @@ def main() -> None:
 def _interrupted(*_: object) -> None:
     """Say so before anything is taken down; a second interrupt ends the process at once."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    typer.echo("\nStopping. What is finished is kept.", err=True)
+    typer.echo("\nStopping...", err=True)
     raise KeyboardInterrupt
 
 

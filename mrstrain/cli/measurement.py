@@ -21,6 +21,9 @@ from mrstrain.options.measurement import (
 )
 from mrstrain.options.modelling import HeelShape
 
+Load0 = Annotated[
+    Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MetaImage, enhanced DICOM, or a DICOM folder.")
+]
 SliceSpacing = Annotated[
     float | None, typer.Option(help="Voxel edge along the third axis, mm. Default: the same as --spacing.")
 ]
@@ -28,7 +31,7 @@ SliceSpacing = Annotated[
 
 @takes_options
 def label(
-    load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, enhanced DICOM, or a DICOM folder.")],
+    load0: Load0,
     *,
     out: Annotated[
         Path | None, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.", rich_help_panel="Output")
@@ -65,7 +68,7 @@ def label(
 
 @takes_options
 def register(
-    load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, enhanced DICOM, or a DICOM folder.")],
+    load0: Load0,
     loads: Annotated[list[Path], typer.Argument(help="Loaded images.")], out: Out, subject_files: SubjectFiles,
     registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
 ) -> None:  # fmt: skip

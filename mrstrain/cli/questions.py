@@ -19,8 +19,8 @@ def ask(inputs: StudyInputs, names: Sequence[str], picture: Path | str, *, read:
 
     ``read`` shows a question and gives a line.
     """
-    typer.echo(f"Picture of what was found: {picture}")
-    typer.echo("Enter keeps what is in brackets, or leaves it to be filled in later.")
+    typer.echo(f"Picture of the images found: {picture}")
+    typer.echo('Press Enter to accept the value in brackets; "later" leaves the line to be filled in.')
     given: dict[str, Any] = {}
     usual = Answers()
     try:
@@ -86,7 +86,7 @@ def _number(text: str) -> float:
 def _force(text: str) -> float:
     number = _number(text)
     if number <= 0.0:
-        raise ValueError("the normal force presses, so it is positive")
+        raise ValueError("the normal force must be positive (compression)")
     return number
 
 

@@ -71,7 +71,10 @@ def run(
     study: StudyFile,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="Run only these stages, by kind or name (register, 'simulate trebbi'). Repeat for several."),
+        typer.Option(
+            help="Run only these stages, by kind (label, register, mesh, simulate, vary, drive, level, compare) or by "
+            "name ('simulate trebbi'). Repeat for several."
+        ),
     ] = None,
     force: Annotated[
         list[str] | None, typer.Option(help="Stages to run again, by kind or name. Repeat for several.")
@@ -90,10 +93,10 @@ def run(
 
     given = {"--only": only, "--force": force, "--scheduler": scheduler, "--workers": workers}
     if report_only:
-        _refuse_idle("--report-only runs nothing", given | {"--dry-run": dry_run, "--quick": quick})
+        _refuse_idle("--report-only", given | {"--dry-run": dry_run, "--quick": quick})
         tell(report(study))
     elif dry_run:
-        _refuse_idle("--dry-run runs nothing", {name: given[name] for name in ("--scheduler", "--workers")})
+        _refuse_idle("--dry-run", {name: given[name] for name in ("--scheduler", "--workers")})
         for name, told in forecast(study, only=only or (), force=force or (), quick=quick).items():
             say(f"{name}: {told}")
     else:
@@ -103,13 +106,15 @@ def run(
         )  # fmt: skip
 
 
-def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
-    """Refuse options that would change nothing."""
+def _refuse_idle(flag: str, given: Mapping[str, object]) -> None:
+    """Refuse options that would change nothing beside one with which nothing runs."""
     idle = [name for name, value in given.items() if value]
     if idle:
         from dvc.errors import ParameterError
 
-        raise ParameterError(f"{why}, so {', '.join(idle)} would have no effect. Leave out one of them.")
+        raise ParameterError(
+            f"{flag} runs nothing, so {', '.join(idle)} would have no effect. Leave out {flag} or these options."
+        )
 
 
 def cohort(

@@ -58,10 +58,10 @@ class GivenLabels(Options):
     panel: ClassVar[str] = "Inputs"
 
     labels: Path | None = None
-    """Label map. Without --from: the one of this image, which is corrected. The boundaries of its bones and skin move
-    by up to 2.5 voxels to where the image shows them. With --from: the one of that image, which is transferred."""
+    """Label map of this image, to be corrected: the boundaries of its bones and skin move by up to 2.5 voxels to where
+    the image shows them. With --from: label map of that other image, to be transferred."""
     names: Path | None = None
-    """Table of its label names: ITK-SNAP, Slicer or CSV."""
+    """Table of the label names: ITK-SNAP, Slicer or CSV."""
     from_image: Annotated[Path | None, Cli(name="--from")] = None
     """Unloaded image of another subject (same part and side of the body, same contrast), whose label map is --labels.
     The two images are registered; --bone is not needed."""
@@ -136,8 +136,8 @@ class RegistrationOptions(EngineOptions):
     error_model: Annotated[Path | None, Cli(panel="Advanced")] = None
     """Error model written by `mrstrain accuracy`, instead of the built-in one."""
     twin: Flag = False
-    """Also register a synthetic warp (twin) of each pair, whose strain is known, to check the error bars. Takes more
-    than twice the time."""
+    """Also register a synthetic warp (twin) of the unloaded image for each load, whose strain is known, to check the
+    error bars. Takes more than twice the time."""
     allow_unknown_parameters: Annotated[Flag, Cli(panel="Advanced")] = False
     """Accept elastix parameter names that mrstrain does not know."""
 
@@ -173,6 +173,8 @@ class Threads(Options):
 class Cores(Threads):
     """Number of threads, and of loads at the same time."""
 
+    threads: Count | None = None
+    """Threads per worker. Default: the cores, divided among the loads computed at the same time."""
     workers: Count | None = None
     """Loads computed at the same time. Default: as many as cores and loads allow."""
 
@@ -188,6 +190,10 @@ class Seeded(Threads):
 
 class Running(Seeded, Cores):
     """Number of threads, loads at the same time, and the seed of random numbers."""
+
+    threads: Count | None = None
+    """Threads per worker. Default: the cores, divided among the loads computed at the same time. elastix reproduces its
+    results only with the same number of threads."""
 
     def shares(self, loads: int) -> tuple[int, int]:
         """How many of the loads are registered at the same time, and the threads of each."""

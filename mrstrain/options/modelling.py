@@ -43,7 +43,7 @@ class ComparisonLabels(Options):
 
 
 class Finer(NamedTuple):
-    """Another length of edges in one tissue."""
+    """Edge length in one tissue."""
 
     region: str
     edge_mm: Positive
@@ -55,7 +55,7 @@ class Meshing(Options):
     panel: ClassVar[str] = "Model"
 
     edge_mm: Positive = 2.0
-    """Edge length of the cells, mm. Above about four voxels a longer edge changes little."""
+    """Edge length of the cells, mm. Edges longer than about four voxels make little difference."""
     finer: Finer | None = None
     """Region with an edge length of its own, mm, such as: skin 1."""
     limit_s: Annotated[Positive, _limit("Stop meshing after this time, minutes.")] = 3600.0

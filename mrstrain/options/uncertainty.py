@@ -23,17 +23,18 @@ class Uncertainty(Options):
     """Ratio of the edge lengths of a coarser mesh to those of the mesh, such as 1.4, to estimate the error of the
     mesh; all variants are then solved on it."""
     force: NotNegative = 0.0
-    """Of the plate's forces, relative."""
+    """Relative standard uncertainty of the plate's forces."""
     force_n: NotNegative = 0.0
-    """Of the plate's forces, N; combined with ``force`` as the root of the sum of squares."""
+    """Standard uncertainty of the plate's forces, N; combined with ``force`` as the root of the sum of squares."""
     direction_deg: NotNegative = 0.0
-    """Of the plate's normal, in each of the two directions of tilt, degrees."""
+    """Standard uncertainty of the plate's normal, in each of the two directions of tilt, degrees."""
     poisson: NotNegative = 0.0
-    """Of 0.5 - nu of every material, relative."""
+    """Relative standard uncertainty of 0.5 - nu of every material."""
     stiffness: dict[str, NotNegative] = Field(default_factory=dict)
-    """Of the stiffness of a tissue, relative, by the name of the tissue."""
+    """Relative standard uncertainty of the stiffness of a tissue, by the name of the tissue."""
     labels_voxels: NotNegative = 0.0
-    """Of the boundary of the bone and of the inner surface of the skin, in voxels of the label map that is meshed."""
+    """Standard uncertainty of the position of the bone's boundary and of the inner surface of the skin, in voxels of
+    the label map that is meshed."""
     variants: Annotated[tuple[Path, ...], AfterValidator(_different)] = ()
     """Folders with further variants of models, each with a ``variant.toml``: of other codes, or from `converge`."""
     quick: Flag = False

@@ -53,7 +53,7 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
         else:
             yield partial(shown, _lines_of_all() if of_all else _lines())
     except KeyboardInterrupt:
-        console.print("Interrupted. Finished results are kept; incomplete ones are not.")
+        console.print("Interrupted. Finished results are kept.")
         raise
 
 

@@ -90,7 +90,7 @@ class NewStudy:
         todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
         lines += [f"Study file: {self.path}.{todo}", *to_fill_in, f"Next step: mrstrain check {self.path.parent}"]
         lines += [] if found.labels or self.makes_labels or not found.loads else self._without_labels()
-        return [*lines, f"Picture of what was found: {self.picture}"]
+        return [*lines, f"Picture of the images found: {self.picture}"]
 
     def _without_labels(self) -> list[str]:
         """How to go on where the study has neither a label map nor a mask of the bone."""

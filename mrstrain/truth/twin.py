@@ -37,7 +37,7 @@ def twin(
     subject_files, frame
         As in `strain`; the truth is relative to the bone. ``tissue`` is also all that the warped image shows.
     seed : int
-        Of noise and receive field.
+        Of noise and bias field.
 
     Raises
     ------

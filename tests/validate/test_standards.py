@@ -1,4 +1,4 @@
-"""The section by the standards: its answer, its tables and figure, on shears whose coefficients are known."""
+"""The section on standard metrics: its answer, its tables and figure, on shears whose coefficients are known."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def test_the_answer_comes_first_and_names_model_tissue_and_probability() -> None
     one = compared(0.0, 0.01)
     first, accepted, guide = answer(one)
     assert first == (
-        "right: the probability of representation in fat is 100%, weighted by the size of the errors (coefficients "
-        "within their uncertainty: 1 of 1); for no deformation it is 0%."
+        "In fat, the probability of representation is 100 % for right and 0 % for no deformation. It is weighted by "
+        "the size of the errors: 1 of the 1 coefficients of right lie within their uncertainty."
     )
     assert "as the guide asks (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
     assert guide.startswith(
-        "CWA 16799 gives one uncertainty to all coefficients; with it, the probability is 100% for right"
+        "CWA 16799 gives one uncertainty to all coefficients; with it, the probability is 100 % for right"
     )
     (alone,) = answer(compared(0.0, None))
     assert "no error model" in alone
@@ -100,6 +100,6 @@ def test_tables_and_figure_are_written_and_told_in_the_report(tmp_path: Path) ->
     assert float(areas[NOTHING]["d_plus"]) == pytest.approx(max_shear(TRUE), rel=1e-5)
     assert (tmp_path / "Load1" / "coefficients.csv").is_file()
     page = (tmp_path / "report.html").read_text()
-    assert "Load1, by the standards" in page
-    assert "the probability of representation in fat is 100%" in page
+    assert "Load1, standard metrics (CWA 16799, MAVM)" in page
+    assert "In fat, the probability of representation is 100 % for right" in page
     assert Comparison.read(tmp_path).model_forms[0].d_plus == pytest.approx(done.model_forms[0].d_plus, abs=1e-6)

@@ -185,7 +185,7 @@ def test_a_deformation_from_elsewhere_is_a_measurement_too(stretched, tmp_path):
 
 def test_the_headline_is_of_the_region_with_most_strain(stretched):
     strain = "0.052 median, 0.052 at the 95th percentile"  # (1.1² - 1) / 4 = 0.0525
-    assert stretched.headline == f"max. shear strain in fat {ATTACK} {strain}; {stretched.verdict.words}"
+    assert stretched.headline == f"max. shear in fat {ATTACK} {strain}; {stretched.verdict.words}"
     (shear,) = (row for row in stretched.regions if row.quantity == "max_shear")
     small = replace(shear, region="tendon", median=0.2, volume_ml=0.1 * shear.volume_ml)
     none = replace(shear, region="gap", median=float("nan"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 import typer
@@ -55,6 +56,14 @@ def test_a_help_says_each_default_once_and_kinds_in_plain_words(name: str) -> No
     for option in re.split(r" (?=--[a-z])", told):
         assert option.count("Default: ") + option.count("[default: ") <= 1, option
     assert not re.search(r"<list|range>|<str|<int|<float|>\.\.\.", told)
+
+
+def test_the_page_on_register_lists_every_option_and_no_other() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "register.md").read_text(encoding="utf-8")
+    listed = [name for cell in re.findall(r"^\| (`--.*?) \| ", page, re.MULTILINE) for name in cell.split(", ")]
+    offered = [name for one in COMMANDS["register"].params for name in (*one.opts, *one.secondary_opts)]
+    names = [name.strip("`").split(" ")[0] for name in listed]
+    assert sorted(names) == sorted(name for name in offered if name.startswith("--"))
 
 
 def test_a_simulation_says_nothing_of_elastix() -> None:

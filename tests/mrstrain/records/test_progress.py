@@ -90,7 +90,7 @@ def test_of_many_stages_a_pipe_gets_a_line_for_each_that_ended_with_the_time_lef
             clock[0] = 1000.0 + second
             told("Ada: register Load1", "registering", second / 200)
             told("all", "0 of 40 stages", second / 240)
-        told("Ada: register Load1", "max. shear strain in fat 0.131 median; Trust", 1.0)
+        told("Ada: register Load1", "max. shear in fat 0.131 median; Trust", 1.0)
         told("all", "1 of 40 stages", 0.5)
         told("all", "2 of 40 stages", 0.6)  # there already
         clock[0] = 1180.0
@@ -102,8 +102,7 @@ def test_of_many_stages_a_pipe_gets_a_line_for_each_that_ended_with_the_time_lef
     assert lines.err.splitlines() == [
         "all (0 of 40 stages after 60 s, about 3 min left)",
         "all (0 of 40 stages after 2 min, about 2 min left)",
-        "Ada: register Load1: max. shear strain in fat 0.131 median; Trust (1 of 40 stages after 2 min, about 2 min "
-        "left)",
+        "Ada: register Load1: max. shear in fat 0.131 median; Trust (1 of 40 stages after 2 min, about 2 min left)",
         "Ben: mesh: 35,000 tetrahedra (40 of 40 stages after 3 min, about 0 s left)",
         "all (40 of 40 stages after 3 min)",
     ]

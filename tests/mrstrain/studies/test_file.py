@@ -207,11 +207,12 @@ def test_a_simulation_may_have_a_limit_of_time(tmp_path):
 
 def test_the_page_on_studies_names_every_key_and_no_other():
     page = (Path(__file__).parents[3] / "docs" / "reference" / "study-file.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `\[(\w+)(?:\.NAME)?\]` \|(.*)\|$", page, re.MULTILINE)
-    assert {table for table, _ in rows} == set(_fields_at([]))
-    for table, keys in rows:
-        known = set(_fields_at([table, "NAME"] if table == "loads" else [table]))
-        assert set(re.findall(r"`(\w+)`", keys)) == known, table
+    sections = re.findall(r"^## `\[(\w+)(?:\.NAME)?\]`\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
+    assert {table for table, _ in sections} == set(_fields_at([]))
+    for table, section in sections:
+        named = [key for cell in re.findall(r"^\| (`.*?) \| \S", section, re.MULTILINE) for key in cell.split(", ")]
+        known = _fields_at([table, "NAME"] if table == "loads" else [table])
+        assert sorted(named) == sorted(f"`{key}`" for key in known), table
 
 
 def test_two_models_of_one_name_are_refused(tmp_path):

@@ -188,7 +188,7 @@ def heel_in(folder: Path, pair) -> Path:
 def test_a_picture_shows_what_was_found(tmp_path, tiny_pair):
     begun = init(heel_in(tmp_path, tiny_pair))
     assert begun.picture == tmp_path / "study.png"
-    assert begun.summary()[-1] == f"Picture of what was found: {tmp_path / 'study.png'}"
+    assert begun.summary()[-1] == f"Picture of the images found: {tmp_path / 'study.png'}"
     with Pixels.open(begun.picture) as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     assert pixels.shape[0] > 600  # two rows: the unloaded image in three planes, and two loads
@@ -200,10 +200,10 @@ def test_no_picture_is_no_reason_to_write_no_study_file(tmp_path):
     begun = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "tissues.nii.gz"))
     assert begun.path.is_file()
     assert not (tmp_path / "study.png").exists()
-    assert re.fullmatch(r"Picture of what was found: none, .*Load0\.nii\.gz.*", begun.summary()[-1])
+    assert re.fullmatch(r"Picture of the images found: none, .*Load0\.nii\.gz.*", begun.summary()[-1])
     (tmp_path / "study.toml").unlink()
     (tmp_path / "Load0.nii.gz").unlink()
-    assert init(tmp_path).summary()[-1] == "Picture of what was found: none, no unloaded image was found"
+    assert init(tmp_path).summary()[-1] == "Picture of the images found: none, no unloaded image was found"
 
 
 def test_labels_that_lie_elsewhere_are_left_out_of_the_picture(tiny_pair):
@@ -252,7 +252,7 @@ def test_answers_stand_in_the_study_file(tmp_path, tiny_pair, capsys):
     assert asked[0].endswith("or the file of its mask [bone]: ")
     told = capsys.readouterr().out
     assert "'heel': choose one of bone, fat" in told
-    assert "'-5': the normal force presses, so it is positive." in told
+    assert "'-5': the normal force must be positive (compression)." in told
     assert "'abc': a number is needed" in told
     assert "'1 0': three numbers are needed" in told
     study = read_study(place)
@@ -297,7 +297,7 @@ def test_a_terminal_is_asked_and_a_pipe_is_not(tmp_path, tiny_pair, options, ask
     assert process.wait() == 0, told
     assert (b"Load1: normal force, N [later]: " in told) == asks
     assert read_study(place).loads["Load1"].normal_n == (140.0 if asks else None)
-    assert b"Picture of what was found: " in told[told.rindex(b"Picture") :].replace(b"\r\n  ", b" ")
+    assert b"Picture of the images found: " in told[told.rindex(b"Picture") :].replace(b"\r\n  ", b" ")
     if asks:
         (place / "study.toml").unlink()
         piped = subprocess.run(command, input="", capture_output=True, text=True, check=True)

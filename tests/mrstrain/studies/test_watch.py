@@ -38,7 +38,7 @@ MEASURED = StageResult(
             summary=Table("Maximum shear strain", ("tissue", "median", "95th percentile"), (("fat", "0.13", "0.42"),)),
         ),
     ),
-    headline="max. shear strain in fat 0.130 median, 0.420 at the 95th percentile; Trust",
+    headline="max. shear in fat 0.130 median, 0.420 at the 95th percentile; Trust",
 )  # fmt: skip
 
 
