@@ -1,7 +1,5 @@
 """Work in child processes that may crash without taking the caller with them, as native code (elastix) can."""
 
-import ctypes
-import gc
 import logging
 import os
 import re
@@ -11,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as FutureTimeout, wait
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -22,20 +20,13 @@ from loky.backend.utils import kill_process_tree
 from loky.process_executor import BrokenProcessPool, ShutdownExecutorError, TerminatedWorkerError
 
 from dvc.errors import WorkerError
+from dvc.memory import TOO_LITTLE_MEMORY, hand_memory_back, is_lack_of_memory
 
 _T = TypeVar("_T")
 _I = TypeVar("_I")
 Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """`map`, or one that computes in several processes: a task and items, both picklable, give results in their order."""
 
-TOO_LITTLE_MEMORY = "Free memory, use fewer --workers, crop the images, or use a coarser mesh."
-"""What to do where memory ran out."""
-# What the system says of memory for a library, a process or a thread, each in an error of another kind; and the line of
-# a traceback that loky gives as text, as where there is no memory to send a task.
-_NO_MEMORY = (
-    "failed to map segment", "Cannot allocate memory", "can't start new thread", "paging file is too small",
-    "\nMemoryError",
-)  # fmt: skip
 _POLL_S = 0.5
 _UNWIND_S = 5.0  # for threads to end after an error or interrupt
 _MEMORY = {
@@ -45,26 +36,6 @@ _MEMORY = {
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
 }
-
-
-def is_lack_of_memory(failure: BaseException | None) -> bool:
-    """Whether an error, or the one that caused it, says that memory ran out.
-
-    >>> is_lack_of_memory(ImportError("_core.so: failed to map segment from shared object"))
-    True
-    """
-    while failure is not None:
-        if isinstance(failure, MemoryError) or any(sign in str(failure) for sign in _NO_MEMORY):
-            return True
-        failure = failure.__cause__
-    return False
-
-
-def hand_memory_back() -> None:
-    """Give freed memory, which glibc keeps for what comes next, back to the system: after a task that needed much."""
-    with suppress(OSError, AttributeError, TypeError, MemoryError):  # another C library, or no memory even for this
-        gc.collect()
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _is_for_the_log(record: logging.LogRecord) -> bool:

@@ -49,9 +49,8 @@ class Assembler:
         self.own_equations = int(free.sum())
         self.size = self.own_equations + len(shared)
         self.indptr, self.indices = self._pattern(shared)
-        self._row_of = np.repeat(np.arange(self.size), np.diff(self.indptr))
-        above = self.indices != self._row_of
-        self._columns = [np.flatnonzero((self.indices == self.own_equations + n) & above) for n in range(len(shared))]
+        columns = [np.flatnonzero(self.indices == self.own_equations + n)[:-1] for n in range(len(shared))]
+        self._columns = [(column, np.searchsorted(self.indptr, column, side="right") - 1) for column in columns]
         self.equation = self._own
         self._places = self._located(np.arange(len(self._cells)), self.equation)
         self.forget()
@@ -102,7 +101,11 @@ class Assembler:
         ``ahead`` computes the tangent in the same sweep, which is faster if it is needed next.
         """
         if not np.array_equal(state, self._last.state):
-            self._last = (self._corrected(state) if ahead else None) or self._evaluated(state, ahead=ahead)
+            if found := self._corrected(state) if ahead else None:
+                self._last = found
+            else:
+                self.forget()  # frees its tangent before there is another
+                self._last = self._evaluated(state, ahead=ahead)
         by_unknown = self._last.forces.copy()
         return by_unknown, self.by_equation(by_unknown), float(self._last.lowest.min())
 
@@ -116,18 +119,16 @@ class Assembler:
         data[self.indptr[self.idle]] = 1.0  # the diagonal is the first entry of each row
         return data
 
-    def held(self, data: FloatArray, right: FloatArray, equations: IntArray, moves: FloatArray) -> FloatArray:
-        """The values with prescribed moves of shared equations: diagonal 1, columns moved to the right-hand side."""
-        kept = data.copy()
+    def hold(self, data: FloatArray, right: FloatArray, equations: IntArray, moves: FloatArray) -> None:
+        """Prescribe moves of shared equations: their diagonal is 1, their columns go to the right-hand side."""
         for equation, move in zip(equations, moves, strict=True):
-            column = self._columns[equation - self.own_equations]
-            right[self._row_of[column]] -= kept[column] * move
+            column, rows = self._columns[equation - self.own_equations]
+            right[rows] -= data[column] * move
             row = slice(self.indptr[equation], self.indptr[equation + 1])
-            right[self.indices[row][1:]] -= kept[row][1:] * move
-            kept[column], kept[row] = 0.0, 0.0
-            kept[self.indptr[equation]] = 1.0
+            right[self.indices[row][1:]] -= data[row][1:] * move
+            data[column], data[row] = 0.0, 0.0
+            data[self.indptr[equation]] = 1.0
         right[equations] = moves
-        return kept
 
     def spread(self, change: FloatArray) -> FloatArray:
         """Change of every unknown from that of every equation; 0 where fixed."""

@@ -25,7 +25,8 @@ _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
 _TIPPING = 0.5  # fraction of the parallel plate's indentation: a released plate above it has tipped over
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
-_APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
+_APPROACH_MM, _MOST_APPROACH_MM = 0.25, 1.0  # under force control
+_MOST_DISPLACED_MM = 0.6  # under displacement control
 _LEAST_APPROACH_MM = 0.01
 # With a material whose stiffness is far from every published one, or whose stress falls, and below this fraction of the
 # normal load: least steps, of a stage and mm. Where they fail, smaller ones and viscous descent took minutes to fail.
@@ -149,7 +150,7 @@ class LoadPath:
         """Continue to the target, in steps as large as converge, the first a given fraction; whether it is reached."""
         before = self.reached(target)
         way = target.values - before  # displacement steps are small, so that nodes come into contact in order
-        largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
+        largest = _MOST_DISPLACED_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, first, False
         least = min(_LEAST_STEP, 0.01 * largest)
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():

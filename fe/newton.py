@@ -146,7 +146,8 @@ class _Newton:
         held = self.imposed.prescribed
         right = self.imposed.forces_n - now.residual
         right[self.assembler.idle] = 0.0
-        data = self.assembler.held(self.assembler.tangent(now.state), right, held, left_mm)
+        data = self.assembler.tangent(now.state)
+        self.assembler.hold(data, right, held, left_mm)
         level = self.solver.solve(data, right, accuracy)
         solved, turn = self.rotation.solved(now.state, now.forces, data, level, held)
         solved[held] = left_mm  # exact even if the linear solution is approximate

