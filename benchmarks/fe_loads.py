@@ -3,11 +3,11 @@
     git worktree add ../before COMMIT
     python -m benchmarks.fe_loads m36.vtu m81.vtu --before ../before --out benchmarks/results/fe_loads.json
 
-Load1 to Load4 with one material set on meshes as `mrstrain mesh` makes them. Each round solves every mesh in a process
-of its own with the code of the tree before and of this one, in turn. Processor time of the solution alone, after a
-first small load that compiles; ratios are medians over rounds. With --steps, this tree also solves with increments of
-0.1 mm while the plate comes near, and the root mean square difference of the maximum shear strain from that solution is
-told for every load.
+Load1 to Load4 with one material set on meshes as `mrstrain mesh` makes them, --rounds times on each, in a process
+of its own with the code of the tree before and of this one, in turn (every other round in the other order). Processor
+time of the solution alone, after a first small load that compiles, and the peak memory of the whole process; ratios are
+medians over rounds. With --steps, this tree also solves with increments of 0.1 mm while the plate comes near, and the
+root mean square difference of the maximum shear strain from that solution is told for every load.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import platform
 import resource
 import subprocess
 import sys
@@ -42,6 +43,7 @@ MEMORY = {
 
 def one(place: Path, material_set: str, step_mm: float | None, strains: Path | None) -> dict[str, Any]:
     """Solve the loads in this process, with the code that it imports; also write max. shear strain and volumes."""
+    assert Path(fe.__file__).parents[1] == Path(os.environ["PYTHONPATH"]), "the code of another tree is imported"
     if step_mm:
         fe.load_path._APPROACH_MM = fe.load_path._MOST_APPROACH_MM = step_mm
     mesh, plate = fe.read_tet_mesh(place), fe.Plate(*PLATE)
@@ -84,9 +86,9 @@ def compared(mesh: Path, before: Path, material_set: str, rounds: int, *, small_
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in trees}
     with tempfile.TemporaryDirectory() as place:
         strains = {name: Path(place) / f"{name}.npz" for name in (*trees, "small_steps")}
-        for _ in range(rounds):
-            for name, tree in trees.items():
-                runs[name].append(run(tree, mesh, material_set, strains[name]))
+        for number in range(rounds):
+            for name in list(trees)[:: -1 if number % 2 else 1]:
+                runs[name].append(run(trees[name], mesh, material_set, strains[name]))
         pairs = zip(*runs.values(), strict=True)
         ratio = float(np.median([b["processor_s"] / a["processor_s"] for b, a in pairs]))
         result = {"cells": runs["after"][0]["cells"], "set": material_set, **runs, "before_over_after": round(ratio, 2)}
@@ -115,10 +117,13 @@ def main() -> None:
     if not given.before or not given.out:
         parser.error("give --before and --out")
     before, done = given.before.resolve(), []
+    describe = ("git", "describe", "--always", "--dirty")
+    commits = [subprocess.check_output(describe, cwd=tree, text=True) for tree in (before, HERE)]
+    of = {"versions": versions(), "machine": platform.machine(), "commits": [commit.strip() for commit in commits]}
     for mesh in given.meshes:
         done.append(compared(mesh.resolve(), before, given.set, given.rounds, small_steps=given.steps))
         print(json.dumps(done[-1]), flush=True)
-        given.out.write_text(json.dumps({"versions": versions(), "runs": done}, indent=1) + "\n")
+        given.out.write_text(json.dumps(of | {"runs": done}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

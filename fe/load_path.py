@@ -25,8 +25,8 @@ _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
 _TIPPING = 0.5  # fraction of the parallel plate's indentation: a released plate above it has tipped over
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
-_APPROACH_MM, _MOST_APPROACH_MM = 0.25, 1.0  # under force control
-_MOST_DISPLACED_MM = 0.6  # under displacement control
+_APPROACH_MM, _MOST_APPROACH_MM = 0.25, 1.0
+_MOST_OTHERWISE_MM = 0.6  # under displacement control, and with a plate that rotates: 1.0 is less exact (decision 7)
 _LEAST_APPROACH_MM = 0.01
 # With a material whose stiffness is far from every published one, or whose stress falls, and below this fraction of the
 # normal load: least steps, of a stage and mm. Where they fail, smaller ones and viscous descent took minutes to fail.
@@ -150,7 +150,7 @@ class LoadPath:
         """Continue to the target, in steps as large as converge, the first a given fraction; whether it is reached."""
         before = self.reached(target)
         way = target.values - before  # displacement steps are small, so that nodes come into contact in order
-        largest = _MOST_DISPLACED_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
+        largest = _MOST_OTHERWISE_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, first, False
         least = min(_LEAST_STEP, 0.01 * largest)
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
@@ -173,7 +173,7 @@ class LoadPath:
     def _push(self, enough_n: float, most_n: float) -> None:
         """Move the plate along its normal until its force is ``enough_n`` or cannot rise; never above ``most_n``."""
         farthest = self.plate.displacement_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
-        largest, exact = _MOST_APPROACH_MM, self.tolerance
+        largest, exact = self._most_mm, self.tolerance
         rough = replace(exact, force=_ROUGH_FORCE * exact.force, step_mm=_ROUGH_STEP * exact.step_mm)
         while self.plate.force_n[0] < enough_n and largest > _LEAST_APPROACH_MM and not self.is_over():
             step = min(largest, self._to_next_stop(), self._to_force(_AIM * most_n))
@@ -204,12 +204,17 @@ class LoadPath:
         rates = np.log([now.force_n[0] / before.force_n[0], force_n / now.force_n[0]])
         return float(moved_mm * rates[1] / rates[0])
 
+    @property
+    def _most_mm(self) -> float:
+        """Longest step of the approach under force control, mm."""
+        return _MOST_OTHERWISE_MM if self.contact.plate.turns else _MOST_APPROACH_MM
+
     def _to_next_stop(self) -> float:
-        """Step of the approach, mm; its stops are the same wherever it is resumed, and so are the nodes that touch."""
+        """Step of the approach, mm; unless steps have failed, it has the same stops wherever it is resumed."""
         moved_mm = self.plate.displacement_mm[0] - self._start_mm[0]
         stop, step = 0.0, _APPROACH_MM
         while stop < moved_mm + _LEAST_APPROACH_MM:
-            stop, step = stop + step, min(_GROWTH * step, _MOST_APPROACH_MM)
+            stop, step = stop + step, min(_GROWTH * step, self._most_mm)
         return float(stop - moved_mm)
 
     def _go(

@@ -16,6 +16,7 @@ from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
 from fe.elements import CROWDED
 from fe.load_path import PlateState
 from fe.materials import Materials
+from fe.published import doubts
 from fe.solution import LoadState
 
 _SHARES = (0.5, 0.9, 0.99)
@@ -77,6 +78,19 @@ def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials) -> f
     jacobian = np.linalg.det(np.eye(3) + state.gradients) - asked
     off = np.abs(patch_volumes(mesh, jacobian) - 1.0)[mesh.cells].mean(axis=1) > _FAR
     return float(mesh.volumes_mm3[off].sum() / mesh.volumes_mm3.sum())
+
+
+def why_not_reached(state: LoadState, materials: Materials) -> str:
+    """How the search for the load ended, its likely cause and the next step."""
+    least = float(state.strain.jacobian.min())
+    steps = ", even in small steps"
+    if doubts("", materials):
+        steps = " (with an unusual material, small steps are not tried below half of the normal load)"
+    return (
+        f"no equilibrium was found beyond {state.reached:.0%} of the load{steps}; "
+        f"{'cells nearly folded' if least < CROWDED else 'tissue gave way'} (lowest det F {least:.2f}). "
+        "Lower the load, or check its unit and the material parameters."
+    )
 
 
 @dataclass(frozen=True, slots=True)

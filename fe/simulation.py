@@ -131,9 +131,7 @@ class Simulation:
                 when = began if len(state.curve) > 1 else "before the first equilibrium"
                 notes.append(f"{state.load.name}: the time limit was reached {when}.")
         notes += [
-            f"{state.load.name}: no equilibrium was found beyond {state.reached:.0%} of the load, even in small"
-            f" steps; {'cells nearly folded' if (least := self._least_volume(state)) < CROWDED else 'tissue gave way'} "
-            f"(lowest det F {least:.2f}). Lower the load, or check its unit and the material parameters."
+            f"{state.load.name}: {result.why_not_reached(state, self.materials.materials)}"
             for state in self.states
             if state.reached < 1.0 and not state.out_of_time
         ]
@@ -152,9 +150,6 @@ class Simulation:
 
     def _rows(self, state: LoadState) -> list[RegionFigures]:
         return [row for row in self.regions if row.load == state.load.name]
-
-    def _least_volume(self, state: LoadState) -> float:
-        return float(state.strain.jacobian.min())
 
     def _share_off(self, state: LoadState) -> float:
         return result.volume_share_off(self.mesh, state, self.materials.materials)
@@ -200,7 +195,7 @@ class Simulation:
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
             lines.append(
                 f"{self.name}, {state.load.name}:{part} plate displacement {moved:z.2f} mm normal, {along:z.2f} mm "
-                f"shear; max. shear strain, median / 90th percentile: {shear}"
+                f"shear; max. shear, median / 90th percentile: {shear}"
             )
         return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
 

@@ -88,7 +88,7 @@ def synthetic_warp(
     Notes
     -----
     Compared with an image of the true anatomy, denoising removes some fine texture, noise that it leaves
-    moves with the tissue, and partial volume at interfaces is that of the unloaded scan, blurred once more by
+    moves with the tissue, and partial volume at interfaces is that of the unloaded image, blurred once more by
     interpolation. The first makes a registration look worse, the second better. On a phantom at SNR 25 and 0.8 mm, 0.42
     of the noise amplitude remained and 0.18 of the finest texture was lost; the error of the maximum shear strain was
     1.2 times as large in fat, 1.5 times in muscle and 2.5 times in bone (benchmarks/README.md).

@@ -46,7 +46,7 @@ MESH_DOUBT = (
     "meshes (Limitations)"
 )
 _ASSUMED = (
-    "Models by mrstrain: isotropic and elastic; tissues bonded to each other; rigid plate; the unloaded scan is free "
+    "Models by mrstrain: isotropic and elastic; tissues bonded to each other; rigid plate; the unloaded image is free "
     "of stress (Limitations)"
 )
 

@@ -65,7 +65,7 @@ _HOW_TO_READ = (
     "leaves no trace in an image and cannot be detected. Noise raises small shear strains; a repeat scan without load "
     "(--repeat) shows by how much. Without a label map, a strain discontinuity at a tissue interface is smoothed over "
     "about one control point spacing (3 to 5 mm). Scanner distortion and creep between scans are not detected.",
-    "The noise floor is the apparent strain between two unloaded scans. MAER is the mean over voxels of the mean "
+    "The noise floor is the apparent strain between two unloaded images. MAER is the mean over voxels of the mean "
     "absolute value of the six strain components, SDER the standard deviation of the same.",
     "Missing values are NaN in every map, never zero; valid.nii.gz marks the voxels with values. Programs built on ITK "
     "show NaN in NIfTI files as zero: use the NRRD file or the validity mask there.",

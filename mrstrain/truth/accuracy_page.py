@@ -28,7 +28,7 @@ _PLACES = {
 """Stems of the files of figures, and what the errors are shown by there; the first stands on the first screen."""
 _OF_ANSWER = (
     "Max. shear: maximum shear strain (E₁ − E₃)/2 (Green-Lagrange), no unit. Error: measured minus true, over all "
-    "motions with strain (RMSE: root mean square error). Noise floor: max. shear measured between two unloaded scans."
+    "motions with strain (RMSE: root mean square error). Noise floor: max. shear measured between two unloaded images."
 )
 _OF_ERRORS = (
     "Error: measured minus true maximum shear strain (SD: standard deviation, RMSE: root mean square, p95: 95th "
@@ -150,7 +150,7 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], p
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
         floor = attrgetter("tissue", "maer", "sder", "shear_p50", "shear_p95")
         noise = tuple(tuple(map(_told, floor(f))) for f in floors)
-        tables.append(Table("Noise floor: apparent strain between two unloaded scans", of_floor, noise, _OF_FLOOR))
+        tables.append(Table("Noise floor: apparent strain between two unloaded images", of_floor, noise, _OF_FLOOR))
     preset, voxel, snr = errors[0].condition
     title = f"By motion and tissue: {preset}, voxels of {voxel} mm, SNR {snr:g}"
     return Section(title, tables=tuple(tables), pictures=tuple(pictures), pictures_first=True)

@@ -60,6 +60,7 @@ def test_it_ends_within_a_minute_with_its_cause(
     notes = " ".join(done.notes)
     assert f"a: {TOLD}" in notes
     assert re.search(cause, notes)
+    assert ("small steps are not tried below half of the normal load" in notes) == (most == DOUBTED_STEPS)
     assert counted.steps < most
     assert counted.seconds < MINUTE
 

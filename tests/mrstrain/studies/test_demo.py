@@ -140,7 +140,7 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
         )
     assert pages == [tmp_path / "demo" / "results" / "report.html"]
     found = [what for case, what, fraction in told if case == "register Load2" and fraction == 1.0]
-    assert re.fullmatch(r"max\. shear strain in \w+ [\d.]+ median, [\d.]+ at the 95th percentile; .*", *found)
+    assert re.fullmatch(r"max\. shear in \w+ [\d.]+ median, [\d.]+ at the 95th percentile; .*", *found)
     assert not shown.complete  # the rest has no result
     assert shown.lines[0].startswith("Verdicts on the registrations: Load2 ")
     error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) of ([\d.]+)", shown.lines[1]).groups())
