@@ -1,8 +1,10 @@
 """The errors of mrstrain: one root, and each also a ValueError or a RuntimeError.
 
 A message says what was wrong, which rule it broke, which value was found, and what to do next, in at most three lines
-of 100 characters (`tests/test_messages.py`); full detail goes to the log.
+of 100 characters (`tests/test_messages.py`), so a list of any length is shortened (`few`); full detail goes to the log.
 """
+
+import collections.abc
 
 
 class MrstrainError(Exception):
@@ -39,3 +41,14 @@ class WorkerError(MrstrainError, RuntimeError):
 
 class OutputError(MrstrainError, RuntimeError):
     """A result that cannot be written: folder not writable, disk full, output equal to an input."""
+
+
+def few(items: collections.abc.Iterable[object], most: int = 6) -> str:
+    """A list of any length for a message: the first items, and how many more there are.
+
+    >>> few("abcd"), few("abcd", most=2), few([])
+    ('a, b, c, d', 'a, b and 2 more', '')
+    """
+    listed = [str(item) for item in items]
+    more = len(listed) - most
+    return ", ".join(listed[:most]) + (f" and {more} more" if more > 0 else "")

@@ -33,6 +33,7 @@ _POINTS = 200
 _FLAT_MM = 0.1
 _MANY = 30_000  # polygons: beyond, a PDF holds them as an image, which is then the smaller
 _STEEPEST = 0.05  # smallest component of the plate's normal along the normal force at which the plate is drawn
+_LEVEL = 0.1  # length of shear's part across the body below which it runs up or down
 _MARGIN_MM = 7.0  # around what is drawn, for the letters
 _GAP_IN, _TITLE_IN, _BAR_IN, _TALLEST_IN, _NARROWEST_IN = 0.1, 0.3, 0.66, 4.6, 5.2
 _UNKNOWN = "#c9ced6"
@@ -107,9 +108,11 @@ def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_
     """Fields in one slice, with one colour scale that ends at the 99th percentile (by volume).
 
     Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left. ``axes`` (3,
-    3) are those of the plate: columns are the directions of the normal force (up), of shear (to the right), and their
-    cross product, LPS. ``point_mm`` (3,) lies in the slice, reference configuration, LPS mm.
+    3) are those of the plate: columns are the directions of the normal force (up), of shear (to the right, or to the
+    left; see `across_page`), and their cross product, LPS. ``point_mm`` (3,) lies in the slice, reference
+    configuration, LPS mm.
     """
+    side, axes = float(across_page(axes) @ axes[:, 1]), _on_page(axes)
     cuts = [cut(mesh, field.u_mm, axes, point_mm) for field in fields]
     shears = np.concatenate([field.max_shear for field in fields])
     known = np.isfinite(shears)
@@ -124,15 +127,33 @@ def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_
         how: dict[str, Any] = {"cmap": shades, "norm": norm, "edgecolors": "face", "linewidths": 0.2}
         spot.add_collection(PolyCollection(polygons, array=values, rasterized=many, **how), autolim=False)
         if field.face is not None:
-            spot.axline((0.0, field.face[0]), slope=field.face[1], color=INK, linewidth=1.0, linestyle="--")
+            spot.axline((0.0, field.face[0]), slope=side * field.face[1], color=INK, linewidth=1.0, linestyle="--")
     colour_bar(bar, ScalarMappable(norm, shades), MAX_SHEAR, "max")
     return figure
+
+
+def across_page(axes: FloatArray) -> FloatArray:
+    """Direction of shear or its opposite, (3,) LPS: what points to the right of a page, as slices of images do.
+
+    The patient's left or posterior, whichever is nearer, is on the right; superior where there is neither.
+
+    >>> across_page(np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])).tolist()
+    [0.0, 1.0, 0.0]
+    """
+    shear = axes[:, 1]
+    level = shear[:2] if np.linalg.norm(shear[:2]) > _LEVEL else shear
+    return np.where(level[np.argmax(np.abs(level))] < 0.0, -shear, shear) + 0.0
+
+
+def _on_page(axes: FloatArray) -> FloatArray:
+    """The plate's axes with the one across the page in place of shear."""
+    return np.column_stack([axes[:, 0], across_page(axes), axes[:, 2]])
 
 
 def _slice_panels(
     titles: Sequence[str], corners: Sequence[FloatArray], axes: FloatArray
 ) -> tuple[Figure, list[Axes], Axes]:
-    """Panels for a slice along the first two of the plate's axes, around polygons, and one for a colour bar below.
+    """Panels for a slice, the first two axes up and across the page, around polygons; one for a colour bar below.
 
     They have letters and a scale bar.
     """
@@ -170,9 +191,9 @@ def _lowest_bone_point(mesh: TetMesh, axes: FloatArray) -> FloatArray:
 
 
 def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray) -> tuple[IntArray, list[FloatArray]]:
-    """Cells (k,) cut by the plane of the plate's first two axes, and the deformed polygon (3 or 4, 2) of each.
+    """Cells (k,) cut by the plane of the first two axes, and the deformed polygon (3 or 4, 2) of each.
 
-    Coordinates of polygons are along the shear and the normal force, mm. ``u_mm`` (n, 3) is the displacement of the
+    Coordinates of polygons are along the second and the first axis, mm. ``u_mm`` (n, 3) is the displacement of the
     mesh's nodes, LPS. The other parameters are as in `slice_sheet`.
     """
     height = (mesh.points_mm - point_mm) @ axes[:, 2]
@@ -206,9 +227,9 @@ def force_displacement(states: Sequence[LoadState]) -> Figure:
 
 def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
     """The mesh in a slice through the lowest point of the bone, coloured by tissue."""
-    point = _lowest_bone_point(mesh, plate.axes)
-    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, point)
-    figure, (panel,), room = _slice_panels(["Unloaded"], corners, plate.axes)
+    point, axes = _lowest_bone_point(mesh, plate.axes), _on_page(plate.axes)
+    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), axes, point)
+    figure, (panel,), room = _slice_panels(["Unloaded"], corners, axes)
     look = looks(mesh.regions, TISSUES)
     for name, members in mesh.regions.items():
         mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]

@@ -10,7 +10,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import f as fisher, t as student
 
 from dvc.arrays import FloatArray
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from dvc.tables import read_table
 from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL
 from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
@@ -63,7 +63,7 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
     if "stretch" not in columns or len(stress) != 1:
         raise InputError(
             f"{path}: a curve needs a column 'stretch' (1 + strain) and exactly one of {', '.join(_STRESS)} (kind and "
-            f"unit of stress); its columns are {', '.join(columns) or 'none'}."
+            f"unit of stress); its columns are {few(columns, most=4) or 'none'}."
         )
     mode = None if mode is None else mode.strip().lower()
     if mode is None and "test" not in columns:

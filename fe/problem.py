@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from dvc import TetMesh
 from dvc.arguments import check_fields, checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from dvc.file_names import clash, refuse_as_file_name
 from dvc.mesh import repeated_rows
 from fe.elements import element as formulation
@@ -183,7 +183,7 @@ class Problem:
         for name in (*fixed, SKIN):
             if name not in mesh.facets:
                 raise InputError(
-                    f"The mesh has no surface set '{name}'; it has {', '.join(mesh.facets) or 'none'}. Name the "
+                    f"The mesh has no surface set '{name}'; it has {few(mesh.facets, most=4) or 'none'}. Name the "
                     f"interface with bone, which is fixed, '{BONE}', and the surface that the plate touches '{SKIN}'."
                 )
         check_materials(mesh, self.materials)
@@ -193,7 +193,7 @@ class Problem:
         _check_bonded(mesh, held, fixed)
         on_surface = np.setdiff1d(np.unique(mesh.facets[SKIN]), held)
         if not len(on_surface):
-            raise InputError(f"All nodes of '{SKIN}' are fixed ({', '.join(fixed)}), so the plate cannot deform it.")
+            raise InputError(f"All nodes of '{SKIN}' are fixed ({few(fixed)}), so the plate cannot deform it.")
         Contact(self.plate, mesh.points_mm @ self.plate.axes, on_surface)
         _ = self.notes
 
@@ -219,9 +219,7 @@ def problems_of(
         As `Problem`, or if a load has no plate.
     """
     if isinstance(plate, Mapping) and (bare := [load.name for load in loads if load.name not in plate]):
-        raise InputError(
-            f"The mapping 'plate' has no plate for {', '.join(bare)}; it has one for {', '.join(plate) or 'no load'}."
-        )
+        raise InputError(f"The mapping 'plate' has no plate for {few(bare)}; it has one for {few(plate) or 'no load'}.")
     plate_of = {load.name: plate if isinstance(plate, Plate) else plate[load.name] for load in loads}
     paths = paths_of(loads, {name: tuple(one.axes.round(9).ravel()) for name, one in plate_of.items()})
     return [
@@ -362,12 +360,12 @@ def check_materials(mesh: TetMesh, materials: Materials) -> None:
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
         if region not in mesh.regions:
-            raise InputError(f"The mesh has no region '{region}'; it has {', '.join(mesh.regions) or 'none'}.")
+            raise InputError(f"The mesh has no region '{region}'; it has {few(mesh.regions) or 'none'}.")
         times[mesh.regions[region]] += 1
     if (times != 1).any():
         bare, twice = int((times == 0).sum()), int((times > 1).sum())
         without = [name for name in mesh.regions if name not in materials]
-        bare_regions = f"Give each region one: {', '.join(without)} has none." if without else ""
+        bare_regions = f"Give each region one: {few(without, most=4)} has none." if without else ""
         raise InputError(
             f"Every cell needs exactly one material: {bare} cells have none and {twice} have more than one. "
             f"{bare_regions or 'Each cell must be in exactly one region.'}"
@@ -383,6 +381,6 @@ def _check_bonded(mesh: TetMesh, held: IntArray, fixed: Sequence[str]) -> None:
     loose = ~np.isin(part[mesh.cells[:, 0]], part[held])
     if loose.any():
         raise InputError(
-            f"{int(loose.sum())} of {len(loose)} cells are not connected to a fixed surface ({', '.join(fixed)}). "
+            f"{int(loose.sum())} of {len(loose)} cells are not connected to a fixed surface ({few(fixed, most=4)}). "
             "Tissues are bonded only where they share nodes; merge coincident nodes in the meshing program."
         )

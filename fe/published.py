@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from dvc.file_names import refuse_as_file_name
 from dvc.tables import refuse_damaged_toml
 from fe.hyperelastic import OGDEN
@@ -84,8 +84,8 @@ class MaterialSet:
                 instead = f" (nor for {' or '.join(tried[1:])}, as a substitute)" if tried[1:] else ""
                 raise InputError(
                     f"The material set {self.name} has no material for the region '{region}'{instead}; it has "
-                    f"{', '.join(self.materials)}. Write your own set with this tissue (.toml), or rename the "
-                    "region. If it is a bone, name it among the bones of the mesh."
+                    f"{few(self.materials, most=3)}. Write your own set (.toml) with it, rename the region, or, "
+                    "if it is a bone, name it so when meshing."
                 )
             by_region[region] = known[name.casefold()]
             if name != region:
@@ -160,7 +160,7 @@ def material_set(name: str | Path) -> MaterialSet:
         sets = read_material_sets(name)
         if len(sets) > 1:
             raise InputError(
-                f"{name} contains {len(sets)} material sets ({', '.join(sets)}), and one is needed. Write one file per "
+                f"{name} contains {len(sets)} material sets ({few(sets)}), and one is needed. Write one file per "
                 "set, or read all with fe.read_material_sets."
             )
         return next(iter(sets.values()))

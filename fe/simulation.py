@@ -11,7 +11,7 @@ from dvc.arguments import checked
 from dvc.arrays import FloatArray
 from dvc.atomic_files import write_json
 from dvc.deformation.nodal import OnMesh
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from fe import result
 from fe.decks import write_calculix, write_febio
 from fe.elements import CROWDED, DESCRIPTIONS
@@ -164,7 +164,7 @@ class Simulation:
         """
         states = {state.load.name: state for state in self.states}
         if load not in states:
-            raise InputError(f"No load '{load}' was simulated; simulated loads: {', '.join(states) or 'none'}.")
+            raise InputError(f"No load '{load}' was simulated; simulated loads: {few(states) or 'none'}.")
         return states[load]
 
     def deformation(self, load: str) -> OnMesh:

@@ -78,9 +78,17 @@ class Text:
             return max(choices, key=len, default=HOLE) + "".join(map(inner, added(node.id, within[-1])))
         elif isinstance(node, (ast.Call, ast.Attribute)):
             name = ast.unparse(node.func if isinstance(node, ast.Call) else node).split(".")[-1]
+            if name == "few" and isinstance(node, ast.Call):
+                return listed(node)
             of = self.functions.get(name, []) if name != "name" else []
             choices = [self.of(value, [function], depth + 1) for function in of for value in returned(function)]
         return max(choices, key=len, default=HOLE)
+
+
+def listed(node: ast.Call) -> str:
+    """The longest list that `dvc.errors.few` makes."""
+    most = [one.value.value for one in node.keywords if one.arg == "most" and isinstance(one.value, ast.Constant)]
+    return dvc.errors.few([HOLE] * 99, *most)
 
 
 def assigned(name: str, within: ast.FunctionDef) -> Iterator[ast.expr]:

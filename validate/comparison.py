@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from dvc import LabelMap, TetMesh, Verdict
 from dvc.arguments import checked
 from dvc.atomic_files import whole_folder, write_json
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from dvc.file_names import refuse_as_file_name
 from dvc.own_files import read_json
 from dvc.report.drawing import png_bytes
@@ -143,7 +143,7 @@ class Comparison:
         """
         tissues = dict.fromkeys(c.tissue for c in self.curves)
         if tissue not in tissues:
-            raise InputError(f"The tissue '{tissue}' is not compared; compared tissues are {', '.join(tissues)}.")
+            raise InputError(f"The tissue '{tissue}' is not compared; compared tissues are {few(tissues)}.")
         if kind == "curves":
             return figures.curves_by_load([c for c in self.curves if c.tissue == tissue], self.strains)
         if kind == "areas":

@@ -15,7 +15,7 @@ from dvc import Affine, Grid, MeshFile, TetMesh, read_mesh
 from dvc.arguments import checked
 from dvc.arrays import FloatArray
 from dvc.deformation.nodal import OnMesh
-from dvc.errors import GeometryError, InputError
+from dvc.errors import GeometryError, InputError, few
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
 from dvc.own_files import read_json
@@ -183,7 +183,7 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
     known = {name.casefold(): name for name in source.at_nodes}
     name = next((known[wanted] for wanted in _NAMES if wanted in known), None)
     if name is None:
-        has = f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}."
+        has = f"{place} has no displacement at its nodes; its arrays are {few(source.at_nodes, most=4) or 'none'}."
         if place.suffix.lower() == ".xplt":
             raise InputError(
                 f'{has} Add <var type="displacement"/> to the <plotfile> of the FEBio model, and run it again.'
@@ -208,7 +208,7 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
     if node is None or parts is None:
         raise InputError(
             f"{place}: a table of displacements needs a column 'node' and three columns such as ux, uy, uz, separated "
-            f"by commas; its columns are {', '.join(head)}."
+            f"by commas; its columns are {few(head)}."
         )
     columns = [named.index(c) for c in (node, *parts)]
     try:

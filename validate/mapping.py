@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from dvc import Deformation, LabelMap, StrainField, TetMesh
 from dvc.arguments import checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from dvc.trust.regions import volume_above
 
 ALL = "all soft tissue"
@@ -113,7 +113,7 @@ def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
     known = labels.names.values()
     if missing := [name for name in bones if name not in known]:
         raise InputError(
-            f"The label map has no label '{missing[0]}'; its labels are {', '.join(known)}. Name its "
+            f"The label map has no label '{missing[0]}'; its labels are {few(known)}. Name its "
             "bones (bones, --bone), and check the table of label names."
         )
 

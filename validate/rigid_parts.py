@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.nodal import OnMesh
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 
 _MOVED_MM = 0.05  # tissue that is not loaded hardly moves
 _ROUNDED = 1e-5  # of the largest displacement: what the digits of a file leave
@@ -38,7 +38,7 @@ def without_named_parts(mesh: TetMesh, u_mm: FloatArray, names: Sequence[str]) -
     """
     known = {name.casefold(): name for name in mesh.regions}
     if unknown := [name for name in names if name.casefold() not in known]:
-        raise InputError(f"there is no region '{unknown[0]}' to leave out; the regions are {', '.join(mesh.regions)}.")
+        raise InputError(f"there is no region '{unknown[0]}' to leave out; the regions are {few(mesh.regions)}.")
     kept = _all_but(mesh, [known[name.casefold()] for name in names])
     if not kept.any():
         raise InputError("all regions are left out (leave_out), so nothing is compared. Keep those of tissue.")

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from dvc.arguments import check
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
-from dvc.errors import GeometryError, InputError
+from dvc.errors import GeometryError, InputError, few
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -323,7 +323,7 @@ class LabelMap:
 
     def no_region(self, name: str) -> InputError:
         """The error for a name that no label has."""
-        listed = ", ".join(sorted(self.names.values())) or "none"
+        listed = few(sorted(self.names.values())) or "none"
         unnamed = all(known.startswith("label-") for known in self.names.values())
         told = " No table of names was given (names; --names on the command line), so labels are named by number."
         return InputError(f"The label map has no region '{name}'; it has {listed}.{told if unnamed else ''}")

@@ -12,7 +12,7 @@ from dvc.arrays import Float32Array, FloatArray
 from dvc.deformation.protocol import Deformation, RigidMotion, Within
 from dvc.deformation.strain import StrainField
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps
-from dvc.errors import ImageFileError, InputError
+from dvc.errors import ImageFileError, InputError, few
 from dvc.images.image import Grid, Image, Mask
 from dvc.io.images.labels import read_mask
 from dvc.io.images.nifti import read_nifti_header
@@ -105,7 +105,7 @@ def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]
     names = [folder.resolve().name for folder in folders]
     absent = [load for load in loads if load not in names]
     if absent:
-        raise InputError(f"{place} has no results of {', '.join(absent)}.")
+        raise InputError(f"{place} has no results of {few(absent)}.")
     return [ResultFolder.at(folder) for folder, name in zip(folders, names, strict=True) if not loads or name in loads]
 
 

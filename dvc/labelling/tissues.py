@@ -93,12 +93,15 @@ def label_tissues(
     grid, spacing = image.grid, image.grid.spacing_mm
     marked = {} if marks is None else dict(_regions(fit_mask(marks, grid, "marks")))
     if bone is None and not any(map(is_bones_name, marked)):
-        raise InputError("Labels need the mask of a bone (bone), or the mark of one, such as 'calcaneus' (marks).")
+        raise InputError(
+            "Labels need a bone. Give its mask as bone (--bone), or a mark in it, such as 'calcaneus', as marks "
+            "(--marks)."
+        )
     known = np.zeros(grid.shape, dtype=bool) if bone is None else fit_mask(bone, grid, "bone").inside
     if known.any() and (count := int(known.sum())) < _LEAST_BONE:
         raise InputError(
-            f"The mask of the bone (bone) has only {count} of the image's voxels; a bone has thousands. Give the whole "
-            "bone, or mark a few of its voxels (marks)."
+            f"The mask of the bone has only {count} of the image's voxels; a bone has thousands. Give the whole bone "
+            "as bone (--bone), or mark a few of its voxels and give these as marks (--marks)."
         )
     whole = (tissue_mask(image) if body is None else fit_mask(body, grid, "body")).inside
     soft = whole & ~known
@@ -106,8 +109,8 @@ def label_tissues(
         raise InputError("The bone leaves no soft tissue in the body. Check the masks.")
     if known.any() and (share := float(whole[known].mean())) < _LEAST_IN_BODY:
         raise InputError(
-            f"Only {share:.0%} of the bone is in the body. The mask of the bone (bone) was drawn on another image, or "
-            "that of the body (body; --tissue on the command line) lacks a part."
+            f"Only {share:.0%} of the bone is in the body. The mask of the bone (bone, --bone) was drawn on another "
+            "image, or that of the body (body; --tissue on the command line) lacks a part."
         )
     whole = whole | known
     watch(0.1)
@@ -237,12 +240,12 @@ def _named_bones(
         if number == 0:
             raise InputError(
                 f"The mark of {name} is not in marrow inside a closed dark rim, so the bone cannot be found from it. "
-                "Paint the whole bone and give it as the mask (bone)."
+                "Paint the whole bone and give its mask as bone (--bone)."
             )
         if number in taken:
             raise InputError(
                 f"No dark rim separates {name} from {taken[number]}, so only one of them can be found from its mark. "
-                "Paint the bone on which images are aligned and give it as the mask (bone)."
+                "Paint the bone on which images are aligned and give its mask as bone (--bone)."
             )
         named[name], taken[number] = parts == number, name
     parts = np.where(np.isin(parts, list(taken)), 0, parts)

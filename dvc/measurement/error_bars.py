@@ -112,7 +112,7 @@ def error_bars(
     other = "" if own == voxel else f" (these images: voxels of {own} mm)"
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
-        f"{chosen.source}. Tissues with their own figures: {known or 'none'}; all others use the pooled figures of "
+        f"{chosen.source}. Tissues with errors of their own: {known or 'none'}; all others use the pooled errors of "
         f"soft tissue. {_held(table)} The model applies to tissue that is strained and imaged like these phantoms."
     )
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
@@ -161,7 +161,7 @@ def _held(table: ErrorTable) -> str:
     factors = {f"{factor:.1f}" for factor in (table.widening_of or {"": table.factor}).values()}
     times = " to ".join(dict.fromkeys((min(factors, key=float), max(factors, key=float))))
     whose = "of finite-element models" if table.widening_of else "of the study when each part of it is left out"
-    return f"Intervals are widened {times} times, so that they contain 95 % of the true figures {whose}."
+    return f"Intervals are widened {times} times, so that they contain 95 % of the true values {whose}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:

@@ -339,7 +339,8 @@ class Measurement:
 
     def drawings(self) -> dict[str, Drawing]:
         """The figures of a report, by the name of their files; InputError for one that was read from a folder."""
-        return page.drawings_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
+        of = self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma
+        return page.drawings_of(*of, loaded="repeat" if self.is_repeat else "loaded")
 
     def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
         """Write everything to a folder, complete or not at all; an older folder of that name is replaced.

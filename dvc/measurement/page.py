@@ -43,11 +43,11 @@ _TWIN = (
 
 
 def drawings_of(
-    view: View, made: Source, maps: StrainMaps, floor: NoiseFloor | None, sigma: Float32Array | None
+    view: View, made: Source, maps: StrainMaps, floor: NoiseFloor | None, sigma: Float32Array | None, *, loaded: str
 ) -> dict[str, Drawing]:
     """The figures of a report, by the name of their files: agreement of the images, strain, and its uncertainty.
 
-    The deformed grid lies over the loaded image where there is one.
+    The deformed grid lies over the loaded image where there is one; ``loaded`` is what readers call that image.
     """
     reference, bone, images = made.subject.reference, made.subject.bone, made.images
     labels, below, drawn = made.subject.regions(made.tissue), reference.values, dict[str, Drawing]()
@@ -63,8 +63,9 @@ def drawings_of(
         through = "Slices through the lowest point of the bone along the plate normal."
     shear = Drawing.of(STRAIN, figures.strain_slices, *strain, note=through)
     if images is not None:
-        both = {"unloaded": reference, "loaded, registered": Image(reference.grid, images.registered)}
-        shear = replace(shear, beneath=tuple((name, figures.image_slices(view, image)) for name, image in both.items()))
+        both = {"unloaded": reference, f"{loaded}, registered": Image(reference.grid, images.registered)}
+        bare = {name: figures.image_slices(view, image, *strain[2:]) for name, image in both.items()}
+        shear = replace(shear, beneath=tuple(bare.items()))
     drawn["strain"] = shear
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
     data = _curve_columns(maps, labels)
@@ -130,7 +131,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
             ("Noise floor (repeat scan): mean absolute strain component, mean over voxels (MAER)", floor.maer, ""),
             ("Noise floor (repeat scan): the same, standard deviation over voxels (SDER)", floor.sder, ""),
         ]
-    return Table("Key figures", ("figure", "value", "unit"), tuple(rows))
+    return Table("Key results", ("result", "value", "unit"), tuple(rows))
 
 
 def weights_table(choice: Regularisation) -> Table:
@@ -177,7 +178,7 @@ def error_tables(bars: ErrorBars) -> list[Table]:
     tables = []
     if bars.uncertainty is not None:
         rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
-        columns = ("region", "figure", "measured", "95 % interval from", "to")
+        columns = ("region", "statistic", "measured", "95 % interval from", "to")
         tables.append(Table("Maximum shear strain with 95 % intervals", columns, rows, bars.told))
         if bars.uncertainty.components is not None:
             tables.append(_component_table(bars.uncertainty.components))

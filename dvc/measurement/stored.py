@@ -9,7 +9,7 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation, Within
 from dvc.deformation.strain_maps import StrainMaps
-from dvc.errors import GeometryError, InputError
+from dvc.errors import GeometryError, InputError, few
 from dvc.images.image import Image, Mask
 from dvc.io import error_files, result_folder as files
 from dvc.measurement.error_bars import ErrorBars
@@ -40,7 +40,7 @@ def read_stored(place: Path, image: Image | None) -> Stored:
     """Read the folder of one load; arguments and errors as `dvc.Measurement.read`."""
     loads = sorted({path.parent.name for path in place.glob(f"*/{files.QUALITY}")} - {files.REPEAT})
     if loads and not (place / files.QUALITY).is_file():
-        raise InputError(f"{place} has several loads ({', '.join(loads)}); read one, such as {place / loads[0]}.")
+        raise InputError(f"{place} has several loads ({few(loads)}); read one, such as {place / loads[0]}.")
     told = files.read_quality(place)
     try:
         quality, alignment = Quality.from_dict(told), dict(told["alignment"])

@@ -96,12 +96,12 @@ def strain_slices(
     return coloured(view, reference, max_shear, Scale.of("max_shear", max_shear, largest), outline=outline).finished()
 
 
-def image_slices(view: View, image: Image) -> Figure:
-    """An MR image in grey, on a page of the size of `strain_slices`."""
-    sheet, window = Sheet(view, [""], bar=True), window_of(view, image.values)
-    for plane, axes in sheet.rows[0].items():
-        sheet.grey(plane, axes, image.values, window)
-    return sheet.finished()
+def image_slices(
+    view: View, image: Image, max_shear: Float32Array, largest: float, outline: LabelMap | None = None
+) -> Figure:
+    """An MR image in grey, with all that `strain_slices` draws but the colours: these alone fade between the two."""
+    scale = Scale.of("max_shear", max_shear, largest)
+    return coloured(view, image, max_shear, scale, outline=outline, bare=True).finished()
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> Figure:
@@ -156,8 +156,12 @@ def coloured(
     *,
     planes: Sequence[Plane] = PLANES,
     outline: LabelMap | None = None,
+    bare: bool = False,
 ) -> Sheet:
-    """A scalar in colour over an image, where there is one, in some planes or one; not yet finished."""
+    """A scalar in colour over an image, where there is one, in some planes or one; not yet finished.
+
+    ``bare``: without the colours, but with their bar.
+    """
     chosen: tuple[Plane, ...] = (planes,) if isinstance(planes, str) else tuple(planes)  # type: ignore[assignment]
     if not chosen or any(plane not in PLANES for plane in chosen):
         raise InputError(f"Planes must be from {', '.join(PLANES)}; got {', '.join(map(str, chosen)) or 'none'}.")
@@ -167,7 +171,8 @@ def coloured(
     for plane, axes in sheet.rows[0].items():
         if image is not None:
             sheet.grey(plane, axes, image.values, window)
-        sheet.colours(plane, axes, values, colours, norm)
+        if not bare:
+            sheet.colours(plane, axes, values, colours, norm)
         if outline is not None:
             labels = view.cut(outline.labels, plane)
             sheet.outlines(plane, axes, (labels == label for label in outline.names))

@@ -207,22 +207,30 @@ def _alike(column: Sequence[Cell]) -> list[str]:
 
 
 def record_lines(record: Mapping[str, object]) -> dict[str, str]:
-    """A provenance record as lines of a report."""
+    """A provenance record as lines of a report: parts of it, and parts of these, each have their own."""
     lines: dict[str, str] = {}
     for name, value in record.items():
-        if isinstance(value, Mapping):
-            lines |= {f"{name}: {key}": _line(item) for key, item in value.items()}
-        else:
-            lines[name] = str(value)
+        for key, item in value.items() if isinstance(value, Mapping) else [("", value)]:
+            nested = isinstance(item, Mapping) and all(isinstance(one, Mapping) for one in item.values())
+            deeper: Any = item if nested else {}
+            for part, one in (deeper or {"": item}).items():
+                lines[": ".join(filter(None, (name, key, part)))] = _line(one)
     return lines
 
 
 def _line(value: object) -> str:
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
-        return "\n".join(", ".join(str(v) for v in item.values()) for item in value)
+    if value in (None, [], {}, ()):
+        return "not given"
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {one}" for name, one in value.items() if one not in (None, [], {})) or "not given"
-    return str(value)
+        given = (f"{name}: {_line(one)}" for name, one in value.items() if one not in (None, [], {}, ()))
+        return "; ".join(given) or "not given"
+    if isinstance(value, list | tuple):
+        if isinstance(value[0], Mapping):
+            return "\n".join(", ".join(str(one) for one in item.values()) for item in value)
+        if isinstance(value[0], list | tuple):
+            return ", ".join(f"({_line(one)})" for one in value)
+        return ", ".join(map(_line, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 @lru_cache(maxsize=256)

@@ -211,7 +211,7 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
             for rows in figures
         )
         if not (t.runs and all(sound)):
-            raise ValueError(f"a table has no runs, or its figures are not {shape} finite numbers")
+            raise ValueError(f"a table has no runs, or its statistics are not {shape} finite numbers")
         if t.has_components and not all(length > 0 for length in t.component_correlation_mm):
             raise ValueError("it has no correlation length of the components")
         if not all(factor >= 1.0 for factor in t.widening_of.values()):

@@ -12,7 +12,7 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
-from dvc.errors import ImageFileError, InputError
+from dvc.errors import ImageFileError, InputError, few
 from dvc.tables import read_table, read_text, refuse_half_a_line
 
 _log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ def read_landmarks(
     if missing := [name for name in _COLUMNS if name not in header]:
         raise ImageFileError(
             f"{file}: the column {missing[0]} is missing. The first line must name the columns "
-            f"{', '.join(_COLUMNS)}; it has: {', '.join(header) or 'nothing'}."
+            f"{', '.join(_COLUMNS)}; it has: {few(header) or 'nothing'}."
         )
     for count, (line, cells) in enumerate(rows, start=1):
         row = dict(zip(header, cells, strict=True))
@@ -127,7 +127,7 @@ def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[st
     elif len(names) != len(others) or set(names) & set(others):
         only = sorted(set(names) ^ set(others))
         repeated = sorted({name for some in (names, others) for name in some if some.count(name) > 1})
-        odd = f"only in one file: {', '.join(only) or 'none'}; repeated: {', '.join(repeated) or 'none'}"
+        odd = f"only in one file: {few(only, most=3) or 'none'}; repeated: {few(repeated, most=3) or 'none'}"
         raise InputError(
             f"The point names in {first} ({len(names)} points) and {second} ({len(others)} points) do not match one "
             f"to one ({odd}). Use the same names in both lists, each once."

@@ -9,7 +9,7 @@ import typer
 import mrstrain
 from mrstrain.cli.options import Out, Workers, carry_out, takes_options, tell
 from mrstrain.options import modelling
-from mrstrain.options.measurement import Cores, EngineOptions, Seeded, SubjectFiles
+from mrstrain.options.measurement import Cores, RecordedEngine, RecordedFiles, Seeded
 
 LabelMap = Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")]
 Measured = Annotated[
@@ -112,11 +112,13 @@ def level(
     dvc: Annotated[
         Path,
         typer.Argument(
-            metavar="results", help="Results folder of register, with its settings; or the unloaded image alone."
+            metavar="results",
+            help="Results folder of register, whose record gives defaults of the options below; or the unloaded image "
+            "alone.",
         ),
     ],
     model: Annotated[Path, typer.Argument(help="Folder of a model with one file per load, as in compare.")],
-    out: Out, subject_files: SubjectFiles, engine: EngineOptions, reading: modelling.ModelReading, seeded: Seeded,
+    out: Out, subject_files: RecordedFiles, engine: RecordedEngine, reading: modelling.ModelReading, seeded: Seeded,
     load: Annotated[
         list[str] | None,
         typer.Option(

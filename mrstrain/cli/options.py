@@ -87,6 +87,10 @@ def tell(done: Done) -> None:
 class Grouped(TyperCommand):
     """A command whose help lists its options in groups."""
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """The words after the command, arguments without the braces that typer puts around them."""
+        return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write each group under its name."""
         groups: dict[str, list[tuple[str, str]]] = {}

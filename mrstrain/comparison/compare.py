@@ -41,7 +41,7 @@ class Compared:
     comparison: validate.Comparison
     sections: tuple[Section, ...]
     closing: tuple[Section, ...]
-    taken: tuple[str, ...] = ()  # a line on what was taken from the record of the measurement
+    taken: tuple[str, ...] = ()  # a line on what was taken from the record of the measurement, unless already told
 
     def summary(self) -> list[str]:
         """Summary, a few lines."""
@@ -152,7 +152,7 @@ def compare(
                 target, record=record, methods=said, more=held, on_image=comparison.on_image, each=each
             )
     share(1.0)
-    return Compared(target, result, *parts, taken)
+    return Compared(target, result, *parts, taken if progress is None else ())
 
 
 def _at_once(loads: int) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dvc import load_preset, preset_names
 from dvc.errors import InputError
@@ -14,6 +14,9 @@ from mrstrain.options.measurement import EngineOptions, SubjectFiles
 from mrstrain.options.model import Options
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, Directions
 from mrstrain.records.measured_with import MeasuredWith
+
+_F = TypeVar("_F", bound=SubjectFiles)
+_E = TypeVar("_E", bound=EngineOptions)
 
 
 def fill_labels(given: ComparisonLabels, loads: Sequence[ResultFolder]) -> ComparisonLabels:
@@ -55,7 +58,7 @@ def _recorded_directions(load: ResultFolder) -> dict[str, Any]:
     return {name: vector for name, vector in told.items() if vector is not None}
 
 
-def fill_subject(given: SubjectFiles, record: MeasuredWith) -> SubjectFiles:
+def fill_subject(given: _F, record: MeasuredWith) -> _F:
     """What is known of the unloaded image: as given, or as it was measured with; errors as `MeasuredWith.file`."""
     update: dict[str, Any] = {}
     if given.tissue is None:
@@ -68,7 +71,7 @@ def fill_subject(given: SubjectFiles, record: MeasuredWith) -> SubjectFiles:
     return given.model_copy(update=update)
 
 
-def fill_engine(given: EngineOptions, record: MeasuredWith) -> EngineOptions:
+def fill_engine(given: _E, record: MeasuredWith) -> _E:
     """The engine of a registration: as given, or that of the measurement; errors as `MeasuredWith.find`."""
     if given.engine or given.preset or given.parameters:
         return given

@@ -9,6 +9,7 @@ import numpy as np
 from dvc import Image, Subject, TetMesh, tissue_mask, write_image
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
+from dvc.io.images.dicom import is_dicom
 from dvc.io.result_folder import PROVENANCE, holds_results, result_folders
 from fe import write_tet_mesh
 from mrstrain.comparison.from_record import fill_engine, fill_subject, taken_from_record
@@ -31,8 +32,8 @@ _CHANGED_MM, _FEW = 0.1, 0.01
 
 @door
 def level(
-    dvc: Path | str, model: Path | str, *, out: Path | str, subject_files: options.SubjectFiles,
-    loads: Sequence[str] = (), engine: options.EngineOptions, reading: ModelReading, seeded: options.Seeded,
+    dvc: Path | str, model: Path | str, *, out: Path | str, subject_files: options.RecordedFiles,
+    loads: Sequence[str] = (), engine: options.RecordedEngine, reading: ModelReading, seeded: options.Seeded,
     progress: OnProgress | None = None,
 ) -> Outcome:  # fmt: skip
     """Simulate the measurement of a model: its displacement warps the unloaded image, and the pair is registered.
@@ -68,6 +69,11 @@ def level(
         raise InputError(f"{place} is not a folder with the results of a model (one file for each load).")
     if holds_results(load0):
         load0, subject_files, engine, taken = _from_record(load0, subject_files, engine)
+    elif load0.is_dir() and not any(is_dicom(path) for path in load0.iterdir() if path.is_file()):
+        raise InputError(
+            f"{load0} has neither results of `mrstrain register` nor DICOM images. Give the results first, or the "
+            "unloaded image, and then the folder of the model."
+        )
     for line in taken:  # now, so that a wrong file is noticed before an hour is spent on it
         (progress or (lambda *_: None))(NOTE, line, 0.0)
     # Incompressibility is always enforced: the displacement extrapolated outside the model's mesh is not isochoric.
@@ -106,12 +112,12 @@ def level(
     if len(failures) == len(results):
         raise RegistrationError("\n".join(failures))
     told = f"Forward-model result, for compare: {target / name}"
-    return Outcome(target / name, (*taken, *notes, *smoothed, *failures, told))
+    return Outcome(target / name, (*(taken if progress is None else ()), *notes, *smoothed, *failures, told))
 
 
 def _from_record(
-    dvc: Path, files: options.SubjectFiles, engine: options.EngineOptions
-) -> tuple[Path, options.SubjectFiles, options.EngineOptions, tuple[str, ...]]:
+    dvc: Path, files: options.RecordedFiles, engine: options.RecordedEngine
+) -> tuple[Path, options.RecordedFiles, options.RecordedEngine, tuple[str, ...]]:
     """The unloaded image of a measurement, its files and engine unless given, and a line on what was taken."""
     instead = "the unloaded image in place of the results, with the options of the measurement"
     record = MeasuredWith.shared(result_folders(dvc), instead)

@@ -9,7 +9,7 @@ from typing import Any
 from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.deformation.nodal import OnMesh
-from dvc.errors import ExtentError, InputError
+from dvc.errors import ExtentError, InputError, few
 from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import read_json
@@ -182,7 +182,7 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
     if len(loads) > 1:
         raise InputError(
             f"{place}: it is unclear for which load this result is. Name the file after a measured load "
-            f"({', '.join(loads)}), or give the folder of one load as the measurement."
+            f"({few(loads, most=4)}), or give the folder of one load as the measurement."
         )
     if place.stem in (_outcome(place, "reached") or ()):
         raise InputError(f"{place} is a simulation of {place.stem}, but the measured load is {loads[0]}.")

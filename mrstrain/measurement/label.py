@@ -21,7 +21,7 @@ from dvc import (
     write_vectors,
 )
 from dvc.atomic_files import write_json
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from dvc.registration.register import refuse_one_image_twice
 from dvc.report.drawing import Drawing
 from dvc.report.labels import label_slices
@@ -66,7 +66,7 @@ def label(
     files = LabelFiles.of(out, (source, *masks.paths, *strokes.paths, *drawn.paths))
     if drawn.labels is not None and drawn.from_image is None:
         if masks.paths or strokes.paths:
-            raise InputError("A label map (labels) is corrected by the image alone: give it without masks or marks.")
+            raise InputError("A label map (--labels) is corrected by the image alone: give it without masks or marks.")
         return corrected(source, drawn.labels, drawn.names, files, tell)
     began, image = time.perf_counter(), read_image(source)
     bone, body = (None if one is None else read_mask(one, image.grid) for one in (masks.bone, masks.tissue))
@@ -123,8 +123,8 @@ def read_marks(path: Path, names: Path | None) -> LabelMap:
         if unknown := [number for number in marks.names if number not in MARKED]:
             usual = ", ".join(f"{number} {name}" for number, name in MARKED.items())
             raise InputError(
-                f"{path}: the marks {unknown} have no name. Give a table of names (mark_names), or use the usual "
-                f"numbers: {usual}."
+                f"{path}: the marks {few(unknown)} have no name. Give a table of names as mark_names (--mark-names), "
+                f"or use the usual numbers: {usual}."
             )
         return replace(marks, names={number: MARKED[number] for number in marks.names})
     return marks

@@ -9,7 +9,7 @@ import numpy as np
 import fe
 from dvc import read_labels
 from dvc.atomic_files import write_csv, write_json, write_whole
-from dvc.errors import InputError, MrstrainError
+from dvc.errors import InputError, MrstrainError, few
 from dvc.measurement.subject import bones_of
 from dvc.own_files import read_json
 from dvc.report.drawing import figure_files, save_figure
@@ -97,7 +97,7 @@ def converge(
     known, bones = list(tissues.names.values()), bones_of(tissues, labelling.bones)
     labelling = labelling.model_copy(update={"bones": bones})
     if region not in known or region in bones:
-        raise InputError(f"The label map has no soft tissue '{region}'; it has {', '.join(known)}.")
+        raise InputError(f"The label map has no soft tissue '{region}'; it has {few(known)}.")
     # an unsuitable material set is refused before hours of meshing
     material_set(material).for_regions([name for name in known if name not in bones])
     with output_folder(target), alone(target):

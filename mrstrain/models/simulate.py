@@ -13,7 +13,7 @@ import numpy as np
 
 import fe
 from dvc.atomic_files import write_whole
-from dvc.errors import InputError, MrstrainError, OutputError, WorkerError
+from dvc.errors import InputError, MrstrainError, OutputError, WorkerError, few
 from dvc.file_names import clash
 from dvc.own_files import read_json
 from dvc.threads import usable_cores
@@ -94,10 +94,8 @@ def simulate(
     chosen = material_sets(sets)
     towards = dict(towards or {})
     if strangers := towards.keys() - {load.name for load in loads}:
-        known = ", ".join(load.name for load in loads)
-        raise InputError(
-            f"Directions are given for {', '.join(sorted(strangers))}, which is no load; the loads are {known}."
-        )
+        known = few(load.name for load in loads)
+        raise InputError(f"Directions are given for {few(sorted(strangers))}, which is no load; the loads are {known}.")
     usual = (plate_options.plate_normal, plate_options.shear_direction)
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
     plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}

@@ -80,6 +80,21 @@ class SubjectFiles(BoneAndBody):
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
 
 
+class RecordedFiles(SubjectFiles):
+    """What is known of the unloaded image, by default as in the record of a measurement."""
+
+    bone: Path | None = None
+    """Mask of the bone on the unloaded image; the displacement is zero in it. Default: that of the measurement."""
+    tissue: Path | None = None
+    """Mask of the body. Default: that of the measurement, or found by an intensity threshold."""
+    bone_label: str | None = None
+    """Name of the bone in --labels, instead of --bone. Default: that of the measurement, unless --labels is given."""
+    labels: Path | None = None
+    """Label map of the tissues on the unloaded image. Default: that of the measurement."""
+    names: Path | None = None
+    """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, unless --labels is given."""
+
+
 class MeshAndAxes(Options):
     """What results are written on beside the voxels: a mesh, and the plate's axes."""
 
@@ -119,6 +134,21 @@ class EngineOptions(Options):
     """Named elastix parameters, such as heel-mr."""
     parameters: tuple[Path, ...] = ()
     """Your own elastix parameter file, instead of --preset; each file is one stage."""
+
+
+class RecordedEngine(EngineOptions):
+    """The engine of the non-rigid registration, by default that of the record of a measurement."""
+
+    engine: Annotated[str, AfterValidator(_known_engine)] | None = None
+    """Registration engine: gauss-newton or elastix. Default: that of the measurement; with --preset or --parameters,
+    elastix."""
+    borders: Flag | None = None
+    """gauss-newton with --labels: allow strain discontinuities at tissue interfaces. Default: as in the measurement."""
+    preset: str | None = None
+    """Named elastix parameters, such as heel-mr. Default: those of the measurement, if it was made with elastix."""
+    parameters: tuple[Path, ...] = ()
+    """Your own elastix parameter file, instead of --preset; each file is one stage. Default: those of the
+    measurement."""
 
 
 class RegistrationOptions(EngineOptions):

@@ -39,7 +39,9 @@ def read_subject(
     elif files.names is not None or files.bone_label is not None:
         raise InputError("names and bone_label need a label map (labels).")
     if files.bone is not None and files.bone_label is not None:
-        raise InputError("The bone was given twice: use either the mask (bone) or the label (bone_label).")
+        raise InputError(
+            "The bone was given twice: use the mask (bone, --bone) or the label (bone_label, --bone-label)."
+        )
     bone = None if files.bone is None else read_mask(files.bone, reference.grid)
     if files.bone_label is not None and label_map is not None:
         bone = label_map.region(files.bone_label)

@@ -27,6 +27,7 @@ NOTE = "note"
 _LINE_EVERY_S = 15.0
 _LINE_OF_ALL_EVERY_S = 60.0
 _LEAST_SHARE = 0.02
+_NONE_LEFT = "about 0 s left"
 _MOST_SHARE = 0.99  # of what is not done: no line says 100 % while work goes on
 
 
@@ -135,9 +136,13 @@ def _lines_of_all() -> OnProgress:
             found.extend([f"{case}: {stage}"] if fraction >= 1.0 else [])
         elif found or fraction >= 1.0 or now - printed_at >= _LINE_OF_ALL_EVERY_S:
             printed_at = now
-            left = f", {time_left}" if (time_left := _left(now - began, fraction)) else ""
-            for line in found or ["all"]:
-                print(f"{line} ({stage} after {duration(now - began)}{left})", file=sys.stderr, flush=True)
+            time_left = _left(now - began, fraction)
+            left = f", {time_left}" if time_left not in ("", _NONE_LEFT) else ""
+            after = f"{stage} after {duration(now - began)}"
+            ended = [f"finished: {after}"] if fraction >= 1.0 else []
+            told = [f"{line} ({after}{left})" for line in found or ([] if ended else ["all"])]
+            for line in (*told, *ended):
+                print(line, file=sys.stderr, flush=True)
             found.clear()
 
     return progress

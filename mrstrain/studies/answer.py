@@ -10,8 +10,9 @@ from mrstrain.measurement.answer import table_of_loads
 from validate import NOTHING, Comparison
 
 _NEAREST = (
-    " Best match: smallest area between the strain-volume curves of model and measurement in that tissue. A dash: no "
-    "model is better than no deformation."
+    " Best match: smallest area between the strain-volume curves of model and measurement in that tissue alone; the "
+    "sentences above judge all soft tissue together. In brackets: models whose intervals overlap with its interval. "
+    "A dash: no model is better than no deformation, or hardly any tissue is strained."
 )
 
 
@@ -37,15 +38,21 @@ def answer_of(
 
 
 def _nearest(folder: Path) -> dict[tuple[str, str], str]:
-    """The model with the smallest area for each load and tissue, if it is below that of a model without deformation."""
+    """The model with the smallest area for each informative load and tissue, and those that may be as good.
+
+    None if its area is not below that of a model without deformation.
+    """
     try:
-        areas = [area for area in Comparison.read(folder).areas if not area.levelled]
+        comparison = Comparison.read(folder)
     except InputError:
         return {}
+    areas = [a for a in comparison.areas if not a.levelled and a.load not in comparison.ranking.uninformative]
     found: dict[tuple[str, str], str] = {}
     for key in dict.fromkeys((area.load, area.tissue) for area in areas):
-        of = {area.model: area.best_ml for area in areas if (area.load, area.tissue) == key}
-        best = min(of, key=lambda name: (of[name], name != NOTHING))
-        if best != NOTHING:
-            found[key] = best
+        best, *others = sorted(
+            (area for area in areas if (area.load, area.tissue) == key), key=lambda a: (a.best_ml, a.model != NOTHING)
+        )
+        if best.model != NOTHING:
+            near = [other.model for other in others if other.model != NOTHING and other.low_ml <= best.high_ml]
+            found[key] = f"{best.model} ({', '.join(near)})" if near else best.model
     return found

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc.atomic_files import write_csv, write_json
-from dvc.errors import InputError
+from dvc.errors import InputError, few
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
 from dvc.own_files import read_rows
 from dvc.report.drawing import Drawing
@@ -83,13 +83,11 @@ def cohort(
     read = [read_study(place) for place in studies]
     names = [study.study.name for study in read]
     if not read or len(set(names)) < len(names):
-        raise InputError(
-            f"A cohort needs studies with different names ([study] name); got {', '.join(names) or 'none'}."
-        )
+        raise InputError(f"A cohort needs studies with different names ([study] name); got {few(names) or 'none'}.")
     target = Path(out)
     ranges = {study.compare.strains for study in read}
     if len(ranges) > 1:
-        raise InputError(f"The studies have different ranges of strain ([compare] strains): {sorted(ranges)}.")
+        raise InputError(f"The studies have different ranges of strain ([compare] strains): {few(sorted(ranges))}.")
     refuse_other_laws(read)
     with output_folder(target), alone(target):
         ran = run_studies(read, scheduler=scheduler, workers=workers, follower=Follower(progress))

@@ -24,9 +24,11 @@ from mrstrain.studies.credibility import study_credibility
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome, left_out_of
 from mrstrain.studies.plan import COMPARISON, REGISTRATION
+from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import error_against_truth
 
 _BY_A_PERSON = {"acquisition", "credibility"}  # tables of the study file with free text
+_OF_A_LOAD = "max. shear, median / 90th percentile:"  # in a line of numbers, which a table or picture shows, too
 _RELOAD_S = 10  # a browser shows the page anew, while a study runs
 
 
@@ -157,6 +159,14 @@ def _incomplete(outcomes: Mapping[str, StageOutcome]) -> list[str]:
     return [*([f"Incomplete: {'; '.join(incomplete)}."] if incomplete else []), *left_out_of(outcomes)]
 
 
+def _result(of: StageResult) -> tuple[str, ...]:
+    """A result for the table of stages: its headline; without a section, also its lines but those of single loads."""
+    if of.sections and of.headline:
+        return (of.headline,)
+    lines = [line for line in of.lines if not (of.headline and _OF_A_LOAD in line)]
+    return tuple(dict.fromkeys([*([of.headline] if of.headline else []), *lines]))
+
+
 def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:
     """Status, time and result of each stage; what a section of the report tells stands there, in one line here."""
     first: dict[str, str] = {}  # the stage that tells a reason
@@ -164,7 +174,7 @@ def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:
     for name, one in outcomes.items():
         told = first.setdefault(one.reason, name)
         reason = f"Same reason as for {told}." if one.reason and told != name else one.reason
-        result = (one.result.headline,) if one.result.sections and one.result.headline else one.result.lines
+        result = _result(one.result)
         seconds = None if one.record is None else one.record.seconds
         rows.append((name, one.status, seconds, "\n".join((reason, *result)).strip()))
     note = "Time of the run that made the result, on one core while other stages were running."

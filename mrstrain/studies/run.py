@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from dvc import Verdict
-from dvc.errors import InputError, ParameterError
+from dvc.errors import InputError, ParameterError, few
 from dvc.io.result_folder import REPORT
 from dvc.threads import usable_cores
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
@@ -236,7 +236,7 @@ def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence
     for name in force if only else ():
         forced = [stage for stage in stages if name in (stage.name, stage.kind)]
         if forced and not any({stage.name, stage.kind} & {*only} for stage in forced):
-            raise InputError(f"force ({name}) has no effect, because only ({', '.join(only)}) excludes this stage.")
+            raise InputError(f"force ({name}) has no effect, because only ({few(only)}) excludes this stage.")
 
 
 @contextmanager

@@ -178,7 +178,7 @@ def _told(cell: Cell) -> Cell:
 
 
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
-    shares = "voxels", "normal strain", "shear strain", "displacement", "figures"
+    shares = "voxels", "normal strain", "shear strain", "displacement", "statistics"
     columns = *_CONDITION, "motion", "tissue", "remaining error, mean", *(f"{name}, %" for name in shares)
 
     def cells(r: CoverageRow) -> tuple[Cell, ...]:

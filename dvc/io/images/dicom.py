@@ -49,7 +49,10 @@ def read_dicom(place: Path, *, series: str | None = None, max_bytes: int = MAX_B
     frames = _frames_in(place) if place.is_dir() else _frames_of_one(place)
     stacks = _named_stacks(_stacks_of(frames))
     if not stacks:
-        raise ImageFileError(f"{place}: no DICOM images in this folder (subfolders are not searched).")
+        raise ImageFileError(
+            f"{place}: no DICOM images in this folder (subfolders are not searched). Give the folder that holds "
+            "them, or an image file."
+        )
     grid, ordered = _assembled(place, _pick_stack(place, stacks, series).frames)
     refuse_if_too_large(place, grid.shape, max_bytes)
     return grid, read_values(ordered).transpose(2, 1, 0)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from dvc.arguments import checked
 from dvc.arrays import IntArray
-from dvc.errors import GeometryError, InputError
+from dvc.errors import GeometryError, InputError, few
 from dvc.images.image import Grid, LabelMap, Mask
 from dvc.io import StrPath
 from dvc.io.images.read import read_voxels
@@ -24,7 +24,6 @@ from dvc.tables import read_table, read_text, refuse_half_a_line
 
 _log = logging.getLogger("dvc.images")
 
-_SHOWN = 12
 _COUNTED = 1 << 16
 _LARGEST_LABEL = 2**31
 _NEEDED_OVERLAP = 0.5
@@ -61,7 +60,7 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
         listed = [f"{v}" + (f" ({names[v]})" if v in names else "") + f": {n} voxels" for v, n in counts.items()]
         raise InputError(
             f"{place}: a mask must have zeros and one other value, but this file has {len(counts)}: "
-            f"{_shortened(listed)}. It is a label map: use --labels and --bone-label, or save one region as a mask."
+            f"{few(listed, most=3)}. It is a label map: use --labels and --bone-label, or save one region as a mask."
         )
     mask = Mask(own, labels != 0)
     return mask if grid is None else fit_mask(mask, grid, f"{place}")
@@ -87,15 +86,15 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
     place = Path(path)
     grid, labels, present = _integers(place, "label map")
     if min(present) < 0:
-        raise InputError(f"{place}: labels must not be negative; found {_shortened([v for v in present if v < 0])}.")
+        raise InputError(f"{place}: labels must not be negative; found {few(v for v in present if v < 0)}.")
     known = read_names(names) if isinstance(names, str | PathLike) else names
     if known is None:
         known = _segment_names(place) or {v: f"label-{v}" for v in present}
     nameless = [v for v in present if v not in known]
     if nameless:
         source = f" in {names}" if isinstance(names, str | PathLike) else ""
-        lack = f"labels without a name{source}: {_shortened(nameless)}"
-        raise InputError(f"{place}: {lack}. Names are given for {_shortened(sorted(known))}; add the missing ones.")
+        lack = f"labels without a name{source}: {few(nameless, most=4)}"
+        raise InputError(f"{place}: {lack}. Names are given for {few(sorted(known), most=4)}; add the missing ones.")
     return LabelMap(grid, labels, {v: known[v] for v in present})
 
 
@@ -241,9 +240,9 @@ def _integers(path: Path, what: str) -> tuple[Grid, IntArray, dict[int, int]]:
         whole = np.isfinite(voxels) & (np.abs(voxels) < _LARGEST_LABEL)
         whole &= np.rint(np.where(whole, voxels, 0)) == voxels
         if not whole.all():
-            odd = [f"{v:g}" for v in np.unique(voxels[~whole])[:_SHOWN]]
+            odd = [f"{v:g}" for v in np.unique(voxels[~whole])]
             raise InputError(
-                f"{rule} {int((~whole).sum())} voxels are not, such as {_shortened(odd)}. Threshold probability maps "
+                f"{rule} {int((~whole).sum())} voxels are not ({few(odd, most=3)}). Threshold probability maps "
                 "first, and resample labels only by nearest neighbour."
             )
     elif int(voxels.max()) >= _LARGEST_LABEL:
@@ -263,11 +262,6 @@ def _counts(labels: npt.NDArray[Any]) -> dict[int, int]:
     else:
         values, counts = np.unique(labels, return_counts=True)
     return {int(v): int(n) for v, n in zip(values, counts, strict=True) if v != 0}
-
-
-def _shortened(items: list[Any]) -> str:
-    more = len(items) - _SHOWN
-    return ", ".join(str(i) for i in items[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _segment_names(path: Path) -> dict[int, str]:

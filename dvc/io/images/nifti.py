@@ -35,7 +35,10 @@ def read_nifti_header(
     header, compressed = _header(path)
     sizes = [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
     if vectors and (sizes[3:5] != [1, components] or any(n not in (0, 1) for n in sizes[5:])):
-        raise ImageFileError(f"{path}: the NIfTI has shape {tuple(sizes)}; (ni, nj, nk, 1, {components}) is needed.")
+        raise ImageFileError(
+            f"{path}: the NIfTI has shape {tuple(sizes)}; a displacement image has (ni, nj, nk, 1, {components}). If "
+            "this is an MR image, register it (mrstrain register); otherwise export the displacement again."
+        )
     shape, count = _sizes(path, sizes[:3] if vectors else sizes)
     layout = (*shape, components) if vectors else shape
     # Size and count come first: a header that is wrong there is not worth a look at its geometry.

@@ -135,8 +135,10 @@ def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFil
         raise InputError(f"The unit of a mesh must be mm or m; got {unit!r}.")
     if frame not in [*TO_LPS]:
         raise InputError(f"The frame of a mesh must be LPS or RAS; got {frame!r}.")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; a mesh is one file. Give the file ({', '.join(_READERS)}).")
     if path.suffix.lower() not in _READERS:
-        raise InputError(f"{path}: the name of a mesh file must end in {', '.join(_READERS)}; got {path.suffix!r}.")
+        raise InputError(f"{path}: the name of a mesh file must end in {', '.join(_READERS)}.")
     if not path.is_file():
         raise ImageFileError(f"{path}: no such file. Check the path.")
     try:

@@ -102,6 +102,6 @@ def _in_own_frame(mesh: MeshFile, name: str, values: FloatArray, rows: int, what
 
 def _check_name(path: Path, ending: str, mesh: MeshFile) -> None:
     if path.suffix.lower() != ending:
-        raise InputError(f"{path}: the file name must end in {ending}; got {path.suffix!r}.")
+        raise InputError(f"{path}: the file name must end in {ending}.")
     if path.resolve() == mesh.path.resolve():
         raise InputError(f"{path}: this is the mesh itself; write the results to another file.")

@@ -19,6 +19,8 @@ const nifti = async (id) => {
   for (let at = header.getFloat32(108, true) + row; at < bytes.length; at++) bytes[at] += bytes[at - row];
   return bytes;
 };
+/* As in the pictures: the patient's right is on the left of a coronal or axial slice, anterior of a sagittal one. */
+const asRadiologistsRead = { isRadiologicalConvention: true, sagittalNoseLeft: true };
 for (const box of document.querySelectorAll(".viewer")) {
   const button = box.querySelector("button");
   const volume = async (node, more) => {
@@ -35,7 +37,7 @@ for (const box of document.querySelectorAll(".viewer")) {
       const shown = [];
       for (const [number, canvas] of canvases.entries()) {
         canvas.parentElement.hidden = false;
-        const view = new niivue.Niivue({ backColor: [1, 1, 1, 1], isColorbar: true });
+        const view = new niivue.Niivue({ backColor: [1, 1, 1, 1], isColorbar: true, ...asRadiologistsRead });
         await view.attachToCanvas(canvas);
         view.addVolume(await volume(image, { colormap: "gray", cal_min: 0, cal_max: Number(image.dataset.most) }));
         const scale = Number(overlays[number].dataset.most);

@@ -220,14 +220,16 @@ def test_a_repeat_scan_has_what_applies_to_it_alone(tiny_pair, measured):
     sections = [one.section(dict.fromkeys(("strain", "curves"), Picture("", "", PNG))) for one in (loaded, repeat)]
     titles = [[table.title for table in section.tables] for section in sections]
     assert set(titles[0]) - set(titles[1]) >= {"Regularisation weights"}
-    assert set(titles[1]) == {"Key figures", "Maximum shear strain by region"}
-    (note,) = [table.note for table in sections[1].tables if table.title == "Key figures"]
+    assert set(titles[1]) == {"Key results", "Maximum shear strain by region"}
+    (note,) = [table.note for table in sections[1].tables if table.title == "Key results"]
     assert (
         note == "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
     )
     assert "error bars" not in str(repeat).lower()
     assert [("A repeat scan without load" in str(one)) for one in (loaded, repeat)] == [True, False]
     assert repeat.sigma is None
+    beneath = [[name for name, _ in one.drawings()["strain"].beneath] for one in (loaded, repeat)]
+    assert beneath == [["unloaded", "loaded, registered"], ["unloaded", "repeat, registered"]]
     assert repeat.error_bars.as_dict() == {"known": False, "reason": "A repeat scan has none: its strain is the error."}
     assert any("Noise floor" in str(row[0]) for row in sections[1].tables[0].rows)
 

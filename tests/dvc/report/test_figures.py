@@ -141,6 +141,7 @@ DRAWN: dict[str, Callable[[np.ndarray], Figure]] = {
     "overlay": lambda a: figures.overlay(VIEW, REFERENCE, a, a),
     "checkerboard": lambda a: figures.checkerboard(VIEW, REFERENCE, a, a),
     "strain": lambda a: figures.strain_slices(VIEW, REFERENCE, a, 0.5, LABELS),
+    "bare": lambda a: figures.image_slices(VIEW, REFERENCE, a, 0.5, LABELS),
     "jacobian": lambda a: figures.jacobian_slices(VIEW, REFERENCE, a),
     "similarity": lambda a: figures.similarity_slices(VIEW, a, a),
     "curves": lambda a: figures.shear_curves(a, LABELS, noise_floor=0.04),
@@ -194,6 +195,21 @@ def test_strain_without_a_value_leaves_the_image_plain() -> None:
     zero = np.zeros(GRID.shape, dtype=np.float32)
     assert saturated(pixels(figures.strain_slices(VIEW, REFERENCE, NOTHING, 0.5))) < 0.01
     assert saturated(pixels(figures.strain_slices(VIEW, REFERENCE, zero, 0.5))) > 0.5
+
+
+def test_a_strain_that_fades_leaves_outlines_and_the_colour_bar() -> None:
+    full, bare = (pixels(DRAWN[name](SHEAR)) for name in ("strain", "bare"))
+    panels = int(full.shape[0] * 0.8)
+    assert (full[panels:] == bare[panels:]).all()
+    assert (bare[panels:].max(axis=-1) - bare[panels:].min(axis=-1) > 0.15).any()  # the bar is in colour
+    coloured = full.max(axis=-1) - full.min(axis=-1) > 0.15
+    assert coloured[:panels].mean() > 0.05
+    assert (bare[:panels].max(axis=-1) - bare[:panels].min(axis=-1) > 0.15).mean() < 0.01  # the yellow marks
+    white = [(page[:panels].min(axis=-1) > 0.95) for page in (full, bare)]
+    plain = pixels(figures.image_slices(VIEW, REFERENCE, SHEAR, 0.5))[:panels].min(axis=-1) > 0.95
+    drawn = white[0] & ~plain
+    assert drawn.sum() > 100
+    assert (white[1] & drawn).sum() > 0.95 * drawn.sum()
 
 
 def test_folding_is_red_and_a_mere_compression_is_not() -> None:

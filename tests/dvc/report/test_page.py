@@ -240,7 +240,7 @@ def drawn_on(panels: Sequence[Axes]) -> None:
 
 
 def test_a_report_of_four_loads_and_six_models_has_room() -> None:
-    """Its kinds of picture and volume, each as large as it may be for less than 7 MB: see the sums below."""
+    """Its kinds of picture and volume, each as large as it may be for a report of less than 7 MB."""
     curves = len(Picture("Curves", "c", chart_png()).small)
     i, j, k = np.indices((81, 130, 115)) / 20.0
     body = (i - 2.0) ** 2 + (j - 3.2) ** 2 + (k - 2.9) ** 2 < 4.8

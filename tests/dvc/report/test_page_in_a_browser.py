@@ -65,6 +65,17 @@ def test_a_page_works_under_its_policy(tab: Tab, tmp_path: Path) -> None:
     np.testing.assert_array_equal(held, np.rint(values * 80).ravel(order="F"))
 
 
+def test_the_viewer_shows_slices_as_the_pictures_do(tab: Tab, tmp_path: Path) -> None:
+    """The patient's right on the left of coronal and axial slices, anterior on the left of sagittal ones."""
+    tab.open(page_of(tmp_path, "Heel"))
+    watched = "niivue.Niivue = class extends niivue.Niivue { constructor(how) { super(how); views.push(this); } }"
+    tab.value(f"window.views = []; library().then(() => {{ {watched}; }})")
+    tab.value("document.querySelector('.viewer button').click()")
+    tab.wait_for("'state' in document.querySelector('.viewer').dataset")
+    shown = tab.value("views.map((view) => [view.opts.isRadiologicalConvention, view.opts.sagittalNoseLeft])")
+    assert shown == [[True, True]] * 2
+
+
 def test_a_name_stays_a_name(tab: Tab, tmp_path: Path) -> None:
     tab.open(page_of(tmp_path, ATTACK))
     tab.value("document.querySelector('.viewer button').click()")

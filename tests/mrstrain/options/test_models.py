@@ -24,6 +24,8 @@ from mrstrain.options.measurement import (
     GivenLabels,
     Marks,
     MeshAndAxes,
+    RecordedEngine,
+    RecordedFiles,
     RegistrationOptions,
     Running,
     Scans,
@@ -64,7 +66,7 @@ COMMANDS: dict[str, tuple[type[Options], ...]] = {
     "converge": (Labelling, Directions, Followed),
     "compare": (ComparisonLabels, ModelReading, ComparisonDirections, ComparisonOn),
     "drive": (MaterialSets, MeshCoordinates),
-    "level": (SubjectFiles, EngineOptions, ModelReading, Seeded),
+    "level": (RecordedFiles, RecordedEngine, ModelReading, Seeded),
 }
 TABLES: dict[type[Options], tuple[str, str]] = {  # table of the study file, and stage that its values reach
     SubjectFiles: ("images", "register Load1"),
@@ -84,6 +86,8 @@ NOT_IN_A_STUDY = {  # what a study has in its own way
     Marks: "marks are keys of [images]",
     GivenLabels: "a label map is corrected or transferred before a study",
     BoneAndBody: "part of SubjectFiles",
+    RecordedFiles: "those of [images], as SubjectFiles",
+    RecordedEngine: "that of [registration], as EngineOptions",
     MeshAndAxes: "its directions are the plate's",
     Cores: "told when it is run",
     Threads: "one for each stage",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,7 +14,7 @@ from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
 from mrstrain.studies.answer import answer_of
 from tests.validate.test_comparison import case, cube, labels, result, sheared
-from validate import Comparison, Criteria, compare
+from validate import NOTHING, Area, Comparison, Criteria, compare
 
 FAT = RegionRow("fat", "max_shear", 10, 1.0, 10, 0.1, 0.0, 0.131, 0.0, 0.3, 0.42, 0.5, 0.6)
 BONE = replace(FAT, region="bone", median=0.0, p95=0.0)
@@ -45,6 +46,22 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
         ("Load1", "fat", "0.131 (0.030 to 0.139)", "0.420", "near"),
         ("Load2", "fat", "0.131 (0.030 to 0.139)", "0.420", "–"),
     )
+
+
+def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_have_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    areas = [
+        Area("far", "Load1", "fat", 3.0, 0.3, 3.0, 2.5, 3.5, 0.1),
+        Area("second", "Load1", "fat", 1.4, 0.1, 1.4, 1.1, 1.7, 0.1),
+        Area("best", "Load1", "fat", 1.0, 0.1, 1.0, 0.8, 1.2, 0.1),
+        Area(NOTHING, "Load1", "fat", 1.3, 0.1, 1.3, 1.1, 1.7, 0.1),
+        Area("best", "Load2", "fat", 0.1, 0.1, 0.1, 0.0, 0.2, 0.1),
+    ]
+    known = SimpleNamespace(areas=areas, ranking=SimpleNamespace(uninformative=("Load2",)))
+    monkeypatch.setattr("mrstrain.studies.answer.Comparison", SimpleNamespace(read=lambda _: known))
+    (first,) = answer_of([section("Load1"), section("Load2")], [Section("Models and loads")], tmp_path)
+    assert [row[-1] for row in first.tables[0].rows] == ["best (second)", "–"]
 
 
 def test_intervals_are_told_of_only_where_there_are_any(tmp_path: Path) -> None:

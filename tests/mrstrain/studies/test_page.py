@@ -134,6 +134,15 @@ def test_the_table_of_stages_repeats_neither_reasons_nor_what_sections_tell(stud
     assert "35399 tetrahedra\nbone 1200 faces" in table  # no section tells it
 
 
+def test_the_table_of_stages_has_the_headline_and_the_notes_of_a_simulation(study: Study) -> None:
+    of_load = "trebbi, Load1: plate displacement 10.30 mm; max. shear, median / 90th percentile: fat 0.131 / 0.425"
+    note = "trebbi: Load1: the material of fat is not stable (Drucker) in 2.0 % of its volume."
+    simulated = StageResult((of_load, note), headline="plate displacement, mm: Load1 10.3")
+    page = page_of(study, ended(study, simulate_trebbi=simulated))
+    assert f"plate displacement, mm: Load1 10.3\n{note}<" in page
+    assert "0.131 / 0.425" not in page
+
+
 def test_without_a_verdict_nothing_is_claimed(study: Study) -> None:
     told = head(page_of(study, ended(study, register_Load1="The bone was not found.", register_Load2="Nor here.")))
     assert told.startswith(

@@ -90,7 +90,7 @@ def test_every_result_is_there_and_the_report_tells_it(done):
     ):
         assert re.search(rf"^{stage}: {found}.* \(\d of 6 stages after .*\)$", stderr, re.M), stage
     assert re.search(r"^mesh: .*, about \d+ (s|min) left\)$", stderr, re.M)
-    assert re.search(r"^all \(6 of 6 stages after \d+ (s|min)\)$", stderr, re.M)
+    assert re.search(r"^finished: 6 of 6 stages after \d+ (s|min)$", stderr, re.M)
     log = (out / "study.log").read_text()
     assert all(f"{stage}: done after" in log for stage in STAGES)
     assert re.search(r"To do: 6 of 6 stages, about \d+ (s|min) on \d+ cores, [\d.]+ GiB of memory", log)

@@ -33,7 +33,7 @@ MEASURED = StageResult(
     ("Load1: Trust.",),
     (
         Section(
-            "Load1", Verdict("trust"), (Table("Key figures", ("figure",), (("rotation",),)),),
+            "Load1", Verdict("trust"), (Table("Key results", ("result",), (("rotation",),)),),
             (Picture("Checkerboard", "", PIXEL), Picture("Maximum shear strain", "How <it> is read.", PIXEL)),
             summary=Table("Maximum shear strain", ("tissue", "median", "95th percentile"), (("fat", "0.13", "0.42"),)),
         ),
@@ -95,7 +95,7 @@ def test_the_report_grows_while_the_study_runs(seen: Seen) -> None:
         assert page.count("<img") == 1  # the strain's alone
         assert "Load1: Trust" in page
         assert "Checkerboard" not in page
-        assert "Key figures" not in page
+        assert "Key results" not in page
         assert "0.42" in page
         assert re.search(r"In progress, at [\d:]{8}: 1 of 5 stages are done, about \d+ s left", page)
         assert '<meta http-equiv="refresh" content="10">' in page

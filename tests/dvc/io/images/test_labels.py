@@ -64,9 +64,9 @@ class TestReadMask:
             read_mask(_save(tmp_path / "a.nii", values))
 
     def test_a_long_list_is_shortened(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="and 323 more") as caught:
+        with pytest.raises(InputError, match="and 332 more") as caught:
             read_mask(_save(tmp_path / "a.nii", np.arange(336, dtype=np.int16).reshape(6, 7, 8)))
-        assert len(str(caught.value)) < 700
+        assert len(str(caught.value)) < 300
 
     @pytest.mark.parametrize("odd", [0.5, np.nan, np.inf, 1e12])
     def test_values_that_are_no_labels(self, tmp_path: Path, odd: float) -> None:

@@ -160,7 +160,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, kind: str) -> None:
 
 
 def test_what_cannot_be_a_mesh_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"\.inp, \.cdb, \.frd, \.xplt, \.msh, \.vtu, \.vtk; got '\.stl'"):
+    with pytest.raises(InputError, match=r"\.inp, \.cdb, \.frd, \.xplt, \.msh, \.vtu, \.vtk\."):
         read_mesh(tmp_path / "heel.stl")
     with pytest.raises(ImageFileError, match="no such file"):
         read_mesh(tmp_path / "heel.vtu")
