@@ -22,7 +22,7 @@ from dvc.io.result_folder import write_displacement
 from dvc.mesh import TetMesh
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.comparison.level import level
-from mrstrain.options.measurement import RegistrationOptions, SubjectFiles
+from mrstrain.options.measurement import RegistrationOptions
 from mrstrain.records.provenance import provenance
 from phantoms import heel_grid, labels_of, scan
 from tests.blocks import block
@@ -153,7 +153,7 @@ def test_levelling_takes_image_bone_and_engine_from_the_measurement(
     ((kind, line, _),) = said  # told once: the outcome does not repeat it
     assert (kind, line in done.lines) == ("note", False)
     ((load0, files, how),) = asked
-    assert (load0, files, how.preset) == (given["load0"], SubjectFiles(bone=given["bone"]), "heel-mr")
+    assert (load0, files.bone, how.preset) == (given["load0"], given["bone"], "heel-mr")
     told = json.loads((done.out / "provenance.json").read_text())
     assert {role: told["inputs"][role] for role in given} == record["inputs"]
     assert told["parameters"]["preset"] == "heel-mr"
