@@ -244,7 +244,9 @@ def told(results, references) -> dict[str, object]:
             said = [int(of.surely_below(b, a)) - int(of.surely_below(a, b)) for of in (band, exact)]
             pairs.append([load, a, b, gap, *said])
     errors = [
-        [e.load, e.model, e.tissue, e.figure, e.error, e.u_num, e.u_input, e.u_d] for one in results for e in one.errors
+        [e.load, e.model, e.tissue, e.statistic, e.error, e.u_num, e.u_input, e.u_d]
+        for one in results
+        for e in one.errors
     ]
     shears = {one.load: one.fields.measured.max_shear[one.fields.common] for one in results}
     strains = [[load, *np.quantile(shear, [0.5, 0.95]).tolist()] for load, shear in shears.items()]

@@ -78,7 +78,7 @@ def labelled(seed: int) -> dict[str, object]:
     for name, given in (("bone", {"bone": truth.region("bone")}), ("strokes", {"marks": strokes(truth, seed)})):
         began = time.process_time()
         made = label_tissues(image, **given)  # type: ignore[arg-type]
-        rows[name] = figures(made, truth) | {"unsure": made.unsure, "processor_s": time.process_time() - began}
+        rows[name] = figures(made, truth) | {"uncertain": made.uncertain, "processor_s": time.process_time() - began}
         print(seed, name, {key: round(float(value), 3) for key, value in rows[name].items()}, flush=True)  # type: ignore[attr-defined]
     return rows
 
@@ -102,7 +102,7 @@ def carried(seed: int, other: int, shape: dict[str, float]) -> dict[str, object]
     made = combined(image, scanned, drawn, over, None, body)  # as `dvc.labels_from` does
     spent = time.process_time() - began  # the non-rigid fit runs in a process of its own
     rows: dict[str, object] = {"seed": seed, "from": other, "shape": shape, "processor_s_without_fit": spent}
-    rows |= {"unsure": made.unsure, "notes": made.notes}
+    rows |= {"uncertain": made.uncertain, "notes": made.notes}
     corrected, alone = correct_labels(image, over.labels).labels, label_tissues(image, truth.region("bone")).labels
     ways = {"registration": over.labels, "corrected": corrected, "all": made.labels, "bone": alone}
     labelled = truth.labels > 0

@@ -213,7 +213,7 @@ def held(runs: list[ErrorSamples], model: ErrorModel) -> dict[str, dict[str, flo
     ):
         case = AccuracyCase("", VOXEL_MM, SNR, row.motion, 0)
         kind = f"{case.kind}{' at 1.2 mm' if row.voxel_mm == '1.2' else ''}"
-        of_row = {"figures": row.figures_within, "normal strain": row.normal_strain_within}
+        of_row = {"figures": row.statistics_within, "normal strain": row.normal_strain_within}
         of_row |= {"shear strain": row.shear_strain_within, "displacement": row.displacement_within}
         for what, share in of_row.items():
             each.setdefault((kind, f"{row.tissue}, {what}"), []).append(share)

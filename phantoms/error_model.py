@@ -12,15 +12,15 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 from dvc.trust.components import NORMAL, SHEAR
 from dvc.trust.error_model import POOLED
-from dvc.trust.uncertainty import figures_of, widened
+from dvc.trust.uncertainty import statistics_of, widened
 from phantoms.accuracy_run import ErrorSamples
 from phantoms.error_moments import BONE_MM, FEW, KNOTS, errors_by_cell
 from phantoms.error_tables import SOFT, OfCondition, by_condition, of_tissue
 
 _THRESHOLDS = (0.1, 0.3)
 _DRAWS = 8  # of each training run, when coverage of the intervals is evaluated
-_OF_OTHERS = 0.97  # of the figures of other motions
-_SOME = 20_000  # of a tissue's samples that figures are drawn of
+_OF_OTHERS = 0.97  # of the statistics of other motions
+_SOME = 20_000  # of a tissue's samples that statistics are drawn of
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class CoverageRow(OfCondition):
         Fraction of the samples whose truth lies within 1.96 standard deviations; 0.95 if the model is right.
     left_over : float
         Mean error minus its expected bias.
-    figures_within : float
+    statistics_within : float
         Fraction of the tissue's statistics (median, 90th and 95th percentile, volumes above 0.1 and 0.3) inside their
         intervals, over the runs; 0.95 over all motions and tissues by construction of the widening. The correlated
         field of the intervals is left out, because it averages out over a tissue.
@@ -45,7 +45,7 @@ class CoverageRow(OfCondition):
     tissue: str
     voxels_within: float
     left_over: float
-    figures_within: float
+    statistics_within: float
     normal_strain_within: float = float("nan")
     shear_strain_within: float = float("nan")
     displacement_within: float = float("nan")
@@ -78,8 +78,8 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
 def widened_for(model: ErrorModel, runs: Sequence[ErrorSamples]) -> ErrorModel:
     """Widen the intervals of an error model, in all its conditions, by runs of motions that it was not fitted to.
 
-    They then hold 97 % of the figures of each tissue, and of soft tissue as a whole, in these runs: more than 95 %, as
-    motions differ. InputError if a run has no table that is close.
+    They then hold 97 % of the statistics of each tissue, and of soft tissue as a whole, in these runs: more than
+    95 %, as motions differ. InputError if a run has no table that is close.
     """
     scores: dict[str, list[FloatArray]] = {}
     for run in runs:
@@ -111,10 +111,10 @@ def coverage_rows(runs: Sequence[ErrorSamples], model: ErrorModel | None = None)
                 float(np.concatenate(some).mean()) for some in zip(*(v.within for v in mine), strict=True)
             )
             remaining = float(np.concatenate([v.remaining for v in mine]).mean())
-            figures = float(
+            statistics = float(
                 np.mean([v.scores <= (table.factor_of(tissue) if factor is None else factor) for v in mine])
             )
-            rows.append(CoverageRow(*condition, motion, tissue, within, remaining, figures, *components))
+            rows.append(CoverageRow(*condition, motion, tissue, within, remaining, statistics, *components))
     return rows
 
 
@@ -126,7 +126,9 @@ class _Validation:
     tissue: str
     remaining: FloatArray  # errors of the maximum shear strain (n,) minus their expected bias
     within: tuple[BoolArray, ...]  # whether the errors are within 1.96 standard deviations: of shear and of components
-    scores: FloatArray  # distance of the true figures from the draws' middle, in units of their interval on that side
+    scores: (
+        FloatArray  # distance of the true statistics from the draws' middle, in units of their interval on that side
+    )
 
 
 def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:
@@ -177,7 +179,7 @@ def _shared(runs: Sequence[ErrorSamples], tissue: str, table: ErrorTable) -> Flo
 
 
 def _widening(validations: Sequence[_Validation]) -> float:
-    """Factor by which 95 % of the figures lie in their intervals, at least 1; NaN without a validation."""
+    """Factor by which 95 % of the statistics lie in their intervals, at least 1; NaN without a validation."""
     if not validations:
         return float("nan")
     return max(1.0, float(np.quantile(np.concatenate([v.scores for v in validations]), 0.95)))
@@ -216,9 +218,9 @@ def _scores(run: ErrorSamples, tissue: str, table: ErrorTable) -> FloatArray:
         bias, sd = (np.concatenate(rows) for rows in zip(*expected, strict=True))
         for _ in range(_DRAWS):
             drawn = np.maximum(every - bias - sd * random.standard_normal(len(bias)), 0.0)
-            draws.append(figures_of(drawn, 1.0, _THRESHOLDS))
+            draws.append(statistics_of(drawn, 1.0, _THRESHOLDS))
     low, middle, high = widened(np.array(draws), 1.0)
-    off = figures_of(run.true_shear[of_tissue(run.tissue, tissue)].astype(np.float64), 1.0, _THRESHOLDS) - middle
+    off = statistics_of(run.true_shear[of_tissue(run.tissue, tissue)].astype(np.float64), 1.0, _THRESHOLDS) - middle
     reach = np.where(off < 0, middle - low, high - middle)
     return np.where(off == 0, 0.0, np.abs(off) / np.maximum(reach, 1e-9))
 

@@ -1,6 +1,6 @@
-"""Comparison error E = S - D of each figure, and its standard uncertainties after ASME V&V 20-2009.
+"""Comparison error E = S - D of each statistic, and its standard uncertainties after ASME V&V 20-2009.
 
-S is a figure of the simulation and D that of the measurement, with its bias removed. The validation uncertainty is
+S is a statistic of the simulation and D that of the measurement, with its bias removed. The validation uncertainty is
 u_val = sqrt(u_num^2 + u_input^2 + u_D^2), from the discretisation, the inputs of the model, and the measurement.
 """
 
@@ -28,11 +28,11 @@ _SURE = (0.025, 0.5, 0.975)
 
 @dataclass(frozen=True, slots=True)
 class ComparisonError:
-    """A figure of one model, tissue and load, simulated and measured; a row of comparison_error.csv.
+    """A statistic of one model, tissue and load, simulated and measured; a row of comparison_error.csv.
 
     Attributes
     ----------
-    figure : str
+    statistic : str
         "median" or "p95" of the maximum shear strain, "volume above 0.3" (mL), or "area" between the curves (mL).
     simulated, measured : float
         Figure of the model (S), and median over the drawn true fields (D), which removes the bias of the measurement.
@@ -51,7 +51,7 @@ class ComparisonError:
     model: str
     load: str
     tissue: str
-    figure: str
+    statistic: str
     simulated: float
     measured: float
     error: float
@@ -72,9 +72,9 @@ def comparison_errors(
     load: str, fields: MappedFields, known: Mapping[str, Band], sensitivities: Mapping[str, Sensitivity],
     thresholds: Sequence[float], strains: tuple[float, float],
 ) -> Iterator[ComparisonError]:  # fmt: skip
-    """Comparison error of each model, tissue and figure under one load; nothing without the measurement's uncertainty.
+    """Comparison error of each model, tissue and statistic under one load, if the measurement's uncertainty is known.
 
-    ``known`` has the bands by tissue, ``sensitivities`` are those of models in the common cells. Figures of the
+    ``known`` has the bands by tissue, ``sensitivities`` are those of models in the common cells. Statistics of the
     measurement beyond the range of the bands are NaN.
     """
     common, levels = fields.common, [t for t in thresholds if t <= 1.5 * strains[1]]
@@ -84,8 +84,8 @@ def comparison_errors(
             continue
         band, inside = known[tissue], where[common]
         volumes = fields.volumes_ml[where]
-        figures = partial(_figures, volumes_ml=volumes, levels=levels)
-        low, measured, high = np.quantile(_drawn_figures(band, levels, float(volumes.sum())), _SURE, axis=0)
+        statistics = partial(_statistics, volumes_ml=volumes, levels=levels)
+        low, measured, high = np.quantile(_drawn_statistics(band, levels, float(volumes.sum())), _SURE, axis=0)
         u_d = band.widening * (high - low) / (2.0 * _NORMAL)
         middle = np.median(band.drawn_ml, axis=0)
         for model, field in fields.models.items():
@@ -93,8 +93,8 @@ def comparison_errors(
                 continue
             shear, of = field.max_shear[where], sensitivities.get(model)
             changes = {} if of is None else {name: change[inside] for name, change in of.changes.items()}
-            simulated = figures(shear)
-            steps = {name: 0.5 * (figures(shear + c) - figures(shear - c)) for name, c in changes.items()}
+            simulated = statistics(shear)
+            steps = {name: 0.5 * (statistics(shear + c) - statistics(shear - c)) for name, c in changes.items()}
             rows = zip(names, simulated, measured, u_d, *steps.values(), strict=True)
             for name, *numbers in rows:
                 s, d, u, *by = map(float, numbers)
@@ -117,8 +117,8 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     shown = [one for one in errors if one.tissue == tissue]
     if not shown:
         return []
-    figures = [one for one in shown if one.figure != AREA]
-    strains = [one for one in figures if not np.isnan(one.error)]
+    statistics = [one for one in shown if one.statistic != AREA]
+    strains = [one for one in statistics if not np.isnan(one.error)]
     beyond = sum(one.significant for one in strains)
     lacking = {
         "u_num": [one.model for one in strains if np.isnan(one.u_num)],
@@ -132,12 +132,12 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
         f"all models in all soft tissue. There, {cause}."
     ]
     words += [f"{u} not given: {', '.join(dict.fromkeys(names))}." for u, names in lacking.items() if names]
-    if unknown := dict.fromkeys(one.figure for one in figures if np.isnan(one.error)):
+    if unknown := dict.fromkeys(one.statistic for one in statistics if np.isnan(one.error)):
         words.append(f"D and E are not defined beyond the range of the measured curves: {', '.join(unknown)}.")
     columns = ("model", "quantity", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E from", "to")
     table = Table(
         "Comparison error and validation uncertainty (ASME V&V 20)", columns,
-        tuple((one.model, one.figure, *(_cell(v) for v in astuple(one)[4:])) for one in shown),
+        tuple((one.model, one.statistic, *(_cell(v) for v in astuple(one)[4:])) for one in shown),
         "S: simulated; D: measured, with the bias of the measurement removed. Standard uncertainties from the mesh "
         "(u_num), the other inputs of the model (u_input) and the measurement (u_D); u_val is the root of the sum of "
         "the squares of those that are known. Interval: E ± 2 u_val; that of the area is its 95 % interval. Strains "
@@ -151,7 +151,7 @@ def _cell(value: float) -> str:
 
 
 def _parts(by_input: Mapping[str, float], u_d: float) -> tuple[float, float, float, float]:
-    """u_num, u_input, u_D and u_val from the change of a figure by one standard uncertainty of each input."""
+    """u_num, u_input, u_D and u_val from the change of a statistic by one standard uncertainty of each input."""
     inputs = [change for name, change in by_input.items() if name != MESH]
     u_num = abs(float(by_input[MESH])) if MESH in by_input else float("nan")
     u_input = float(np.sqrt(np.sum(np.square(inputs)))) if inputs else float("nan")
@@ -159,7 +159,7 @@ def _parts(by_input: Mapping[str, float], u_d: float) -> tuple[float, float, flo
     return u_num, u_input, float(u_d), float(np.sqrt(sum(squares) + u_d**2))
 
 
-def _figures(shear: FloatArray, volumes_ml: FloatArray, levels: Sequence[float]) -> FloatArray:
+def _statistics(shear: FloatArray, volumes_ml: FloatArray, levels: Sequence[float]) -> FloatArray:
     """Median and 95th percentile by volume, and volumes above the levels (mL), of a maximum shear strain (n,)."""
     order = np.argsort(shear)
     share = np.cumsum(volumes_ml[order]) / volumes_ml.sum()
@@ -168,8 +168,8 @@ def _figures(shear: FloatArray, volumes_ml: FloatArray, levels: Sequence[float])
     return np.array([*shear[order][np.minimum(at, len(shear) - 1)], *above])
 
 
-def _drawn_figures(band: Band, levels: Sequence[float], volume_ml: float) -> FloatArray:
-    """The figures of `_figures` of each drawn true field, (draws, figures), from its curve."""
+def _drawn_statistics(band: Band, levels: Sequence[float], volume_ml: float) -> FloatArray:
+    """The statistics of `_statistics` of each drawn true field, (draws, statistics), from its curve."""
     rows = []
     for curve in band.drawn_ml:
         falling = curve[::-1]  # rising volumes, for the inverse of the curve

@@ -151,7 +151,7 @@ class CohortRank:
     mean, low, high, least, greatest : float
         Mean normalised area between curves, its 95 % interval over subjects (Student's t; NaN for one subject), and
         its range.
-    nearest_in : int
+    best_in : int
         Subjects in which it has the smallest area.
     behind, behind_low, behind_high : float
         Mean paired difference to the area of the best model, and its interval, which is simultaneous for all pairs of
@@ -165,7 +165,7 @@ class CohortRank:
     high: float
     least: float
     greatest: float
-    nearest_in: int
+    best_in: int
     behind: float
     behind_low: float
     behind_high: float
@@ -203,10 +203,10 @@ def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[Cohor
         mean, each = float(row.mean()), float("nan")
         if (count := len(row)) > 1:
             each = float(stdtrit(count - 1, _LEVEL) * row.std(ddof=1) / np.sqrt(count))
-        extremes, nearest_in = (float(row.min()), float(row.max())), int(np.count_nonzero(nearest == at))
+        extremes, best_in = (float(row.min()), float(row.max())), int(np.count_nonzero(nearest == at))
         differences = behind, behind - half, behind + half
         ranks.append(
-            CohortRank(names[at], len(subjects), mean, mean - each, mean + each, *extremes, nearest_in, *differences)
+            CohortRank(names[at], len(subjects), mean, mean - each, mean + each, *extremes, best_in, *differences)
         )
     return tuple(ranks)
 

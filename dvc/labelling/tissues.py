@@ -48,7 +48,7 @@ class TissueLabels:
     notes: tuple[str, ...] = ()
 
     @property
-    def unsure(self) -> float:
+    def uncertain(self) -> float:
         """Share of the voxels of the body whose tissue has a probability below 0.9."""
         inside = self.labels.labels > 0
         return float(np.mean(self.probability.max(axis=0)[inside] < _SURE))

@@ -28,17 +28,17 @@ class ErrorBars:
     """Error bars of a load's maximum shear strain, or the reason why there are none."""
 
     uncertainty: Uncertainty | None
-    told: str  # where the figures come from, or why there are none; empty where no images were registered
+    explanation: str  # where they come from, or why there are none; empty if no images were registered
     model: ErrorModel | None = None  # with the one table that was used
     twin: tuple[Judged, ...] = ()  # how the shear came back from the pair's twin, by tissue
     of_twin: str = ""  # what that did to the error bars
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
-        told: dict[str, object] = {"known": False, "reason": self.told}
+        told: dict[str, object] = {"known": False, "reason": self.explanation}
         if self.uncertainty is not None:
             voxel, snr = self.uncertainty.table.spacing_mm.tolist(), round(self.uncertainty.table.snr, 1)
-            told = {"known": True, "source": self.told, "voxel_mm": voxel, "snr": snr}
+            told = {"known": True, "source": self.explanation, "voxel_mm": voxel, "snr": snr}
         if self.twin or self.of_twin:
             told |= {"twin": [asdict(row) for row in self.twin], "of_twin": self.of_twin}
         return told
@@ -53,7 +53,7 @@ class ErrorBars:
         """Draws of the true fields of a measurement; InputError where its errors are not known."""
         sure = self.uncertainty
         if sure is None:
-            raise InputError(f"True fields cannot be drawn, because there are no error bars. {self.told}")
+            raise InputError(f"True fields cannot be drawn, because there are no error bars. {self.explanation}")
         if sure.to_bone_mm is None:
             raise InputError(
                 "True fields cannot be drawn from results of an older version. Register these images again."
@@ -63,7 +63,7 @@ class ErrorBars:
     @property
     def summary(self) -> list[str]:
         """Why there are none, if images were registered, and what the twin did to them, in lines."""
-        lines = [f"No error bars: {self.told}"] * bool(self.uncertainty is None and self.told)
+        lines = [f"No error bars: {self.explanation}"] * bool(self.uncertainty is None and self.explanation)
         return lines + [f"Error bars: {self.of_twin}"] * bool(self.of_twin)
 
 

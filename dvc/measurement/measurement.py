@@ -309,7 +309,7 @@ class Measurement:
         if quantity in TENSOR_COMPONENTS:
             return self.maps.green_lagrange[..., TENSOR_COMPONENTS.index(quantity)]
         if quantity == "sigma" and self.sigma is None:
-            raise InputError("sigma: this measurement has no error bars; `error_bars.told` gives the reason.")
+            raise InputError("sigma: this measurement has no error bars; `error_bars.explanation` gives the reason.")
         known = self.maps.by_quantity | ({} if self.sigma is None else {"sigma": self.sigma})
         if quantity not in known:
             names = ", ".join((*self.maps.by_quantity, "sigma", *TENSOR_COMPONENTS))

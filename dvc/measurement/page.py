@@ -163,7 +163,7 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
     def told(strain: float) -> str:
         return f"{strain:z.3f}" if np.isfinite(strain) else shown(strain)
 
-    known = {(i.region, i.figure): f" ({told(i.low)} to {told(i.high)})" for i in intervals}
+    known = {(i.region, i.statistic): f" ({told(i.low)} to {told(i.high)})" for i in intervals}
     rows = tuple(
         (r.region, *(told(getattr(r, figure)) + known.get((r.region, figure), "") for figure in ("median", "p95")))
         for r in regions
@@ -177,9 +177,9 @@ def error_tables(bars: ErrorBars) -> list[Table]:
     """The intervals, and the errors in the synthetic warp."""
     tables = []
     if bars.uncertainty is not None:
-        rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
+        rows = tuple((i.region, _words(i.statistic), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
         columns = ("region", "statistic", "measured", "95 % interval from", "to")
-        tables.append(Table("Maximum shear strain with 95 % intervals", columns, rows, bars.told))
+        tables.append(Table("Maximum shear strain with 95 % intervals", columns, rows, bars.explanation))
         if bars.uncertainty.components is not None:
             tables.append(_component_table(bars.uncertainty.components))
     if bars.twin:
@@ -201,7 +201,7 @@ def _component_table(known: ComponentUncertainty) -> Table:
     return Table("Standard uncertainty of a component in one voxel", columns, tuple(rows), _COMPONENTS)
 
 
-def _words(figure: str) -> str:
+def _words(statistic: str) -> str:
     percentiles = {"median": "median", "p90": "90th percentile", "p95": "95th percentile"}
-    above = figure.removeprefix("volume_above_").removesuffix("_ml")
-    return percentiles.get(figure, f"volume above {above}, mL")
+    above = statistic.removeprefix("volume_above_").removesuffix("_ml")
+    return percentiles.get(statistic, f"volume above {above}, mL")

@@ -26,7 +26,7 @@ _SOFT = {
 }  # fmt: skip
 _HEEL = ("bone", "calcaneus")
 _INFERIOR = (0.0, 0.0, -1.0)
-_MOST_UNSURE = 0.2  # of the voxels; .11 to .16 on the phantoms for which error bars were found to hold
+_MOST_UNCERTAIN = 0.2  # of the voxels; .11 to .16 on the phantoms for which error bars were found to hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,28 +35,28 @@ class LabelsFromImage:
 
     Attributes
     ----------
-    unsure : float
+    uncertain : float
         Share of the labelled voxels whose tissue has a probability below 0.9.
     notes : tuple of str
         What was not found, and why.
     """
 
-    unsure: float
+    uncertain: float
     notes: tuple[str, ...] = ()
 
     @property
     def told(self) -> str:
         """A sentence on it."""
-        share = f"{100 * self.unsure:.0f} %"
+        share = f"{100 * self.uncertain:.0f} %"
         return f"The label map was made from the image; {share} of its voxels have an uncertain label."
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why a result that relies on these labels needs care; empty where it does not."""
         notes = tuple(f"The label map was made from the image. {note}" for note in self.notes)
-        if self.unsure <= _MOST_UNSURE:
+        if self.uncertain <= _MOST_UNCERTAIN:
             return notes
-        limits = f"use with care above {100 * _MOST_UNSURE:.0f} %"
+        limits = f"use with care above {100 * _MOST_UNCERTAIN:.0f} %"
         correct = "Look at its picture, and correct it with strokes or by hand."
         return (*notes, f"{self.told.removesuffix('.')} ({limits}). {correct}")
 

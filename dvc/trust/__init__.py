@@ -1,1 +1,1 @@
-"""How far a measurement may be trusted: quality, verdict, figures by region, error model and intervals."""
+"""How far a measurement may be trusted: quality, verdict, statistics by region, error model and intervals."""

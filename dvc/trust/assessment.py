@@ -12,8 +12,8 @@ from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
 
 _NOISIER = " even at 1.5 times this noise"
-# Where a figure lowers the verdict: use with care, do not trust; one whose second limit is the lower has to lie above.
-# Beside the limits: decimals and unit of the figure in the sentence that tells of it.
+# Where a quantity lowers the verdict: use with care, do not trust. If the second limit is the lower, it must lie above.
+# Beside the limits: decimals and unit of the quantity in the sentence that tells of it.
 # The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
 # at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a warp of a knee with added
 # noise (slices of 4 mm: apparent maximum shear strain 0.1) and a leg's repeat scan (6 mm: 0.3). Unlikeness is what the
@@ -98,8 +98,8 @@ def assess(
     Returns
     -------
     Quality
-        The figures, and the verdict: "distrust" or "caution" where a figure exceeds its limit, with one sentence for
-        each such figure that gives its value and limits; otherwise "trust".
+        The quantities, and the verdict: "distrust" or "caution" if one exceeds its limit, with a sentence for each such
+        quantity that gives its value and limits; otherwise "trust".
     """
     lowest, at = _lowest(maps.jacobian, maps.grid)
     known = int(np.count_nonzero(maps.valid & tissue.inside))
@@ -130,9 +130,9 @@ def assess(
         findings.append(Verdict("distrust", (f"{folds}, at LPS ({place}) mm.",)))
     if similarity is not None:
         findings += _unlike(similarity, quality, float(maps.grid.spacing_mm.max()))
-    for figure in ("bone_shift_mm", "bone_shear_p95", "lowest_jacobian", "undefined_fraction"):
-        if np.isfinite(value := getattr(quality, figure)):
-            findings += _judged(figure, value)
+    for name in ("bone_shift_mm", "bone_shear_p95", "lowest_jacobian", "undefined_fraction"):
+        if np.isfinite(value := getattr(quality, name)):
+            findings += _judged(name, value)
     findings += _judged("landmark_error_mm", quality.landmarks["median_mm"])
     if floor is not None:
         findings += _judged("floor_shear_p95", floor.max_shear_p95)
@@ -173,9 +173,9 @@ def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[V
     return findings
 
 
-def _judged(figure: str, value: float, distrusted: bool | None = None) -> list[Verdict]:
-    """A figure beside its limits: a finding, or none. ``distrusted``: decided by more than the second limit."""
-    care, distrust, decimals, unit, sentence = _LIMITS[figure]
+def _judged(name: str, value: float, distrusted: bool | None = None) -> list[Verdict]:
+    """A quantity beside its limits: a finding, or none. ``distrusted``: decided by more than the second limit."""
+    care, distrust, decimals, unit, sentence = _LIMITS[name]
     falling = care > distrust
     # NaN: a similarity that is not known counts as none; of the others, what is not finite is not known.
     if value >= care if falling else not (np.isfinite(value) and value > care):

@@ -28,7 +28,7 @@ POOLED = "soft tissue"
 ROWS = ("bias", "sd", "shrinkage", "sd_normal", "sd_shear", "sd_displacement_mm")
 """Figures of a table: bias and standard deviation of the maximum shear strain; mean error of the Green-Lagrange strain
 as a fraction of it, and standard deviation about that of a normal and of a shear component; standard deviation of a
-component of the displacement, mm. The components' figures are the same in all axes."""
+component of the displacement, mm. The components' values are the same in all axes."""
 
 _FORMAT = 2
 _FORMER = 1  # without components
@@ -52,7 +52,7 @@ class ErrorTable:
     whole: Mapping[str, FloatArray]
     runs: tuple[Mapping[str, FloatArray], ...]
     correlation_mm: float  # distance at which the autocorrelation of the shear's error has fallen to 1/e
-    # Factor on intervals as drawn, by which 95 % of the tissues' figures lay in them when each motion of the study
+    # Factor on intervals as drawn, by which 95 % of the tissues' statistics lay in them when each motion of the study
     # was judged by the others; NaN where there was one motion and one heel alone, and intervals stay as drawn.
     widening: float = float("nan")
     widening_of: Mapping[str, float] = field(default_factory=dict)  # the same of one tissue, where it is known

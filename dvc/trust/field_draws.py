@@ -25,7 +25,7 @@ class TrueField:
     green_lagrange : (ni, nj, nk, 6)
         E_xx, E_xy, E_xz, E_yy, E_yz, E_zz.
     max_shear : (ni, nj, nk)
-        Maximum shear strain (E_1 - E_3) / 2. Its error is drawn by its own figures, so it is not exactly that of
+        Maximum shear strain (E_1 - E_3) / 2. Its error is drawn by its own statistics, so it is not exactly that of
         ``green_lagrange``.
     """
 

@@ -1,4 +1,4 @@
-"""The figures by which a registration is judged: folding, similarity, bone, landmarks, noise floor."""
+"""The quantities by which a registration is judged: folding, similarity, bone, landmarks, noise floor."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -66,7 +66,7 @@ class NoiseFloor:
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """The figures behind the verdict.
+    """The quantities behind the verdict.
 
     Attributes
     ----------

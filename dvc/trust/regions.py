@@ -22,7 +22,7 @@ _PERCENTILES = (50.0, 5.0, 90.0, 95.0, 99.0)
 
 @dataclass(frozen=True, slots=True)
 class RegionRow:
-    """One quantity in one region; figures are in its unit, over the voxels with a value, NaN where there is none."""
+    """One quantity in one region; values are in its unit, over the voxels with a value, NaN where there is none."""
 
     region: str
     quantity: str

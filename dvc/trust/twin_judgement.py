@@ -11,7 +11,7 @@ from dvc.trust.uncertainty import Uncertainty
 
 _SURE = 0.95
 _DEVIATIONS = 1.96
-_FIGURES = {"median": 50.0, "p90": 90.0, "p95": 95.0}
+_STATISTICS = {"median": 50.0, "p90": 90.0, "p95": 95.0}
 _FEW = 50
 
 
@@ -66,7 +66,7 @@ def judged(
         needed = np.sqrt(np.maximum((error / _DEVIATIONS) ** 2 - claimed**2, 0.0)) / sd  # factor for each voxel
         held = float(np.mean(needed <= 1.0))
         of_voxels = float(np.quantile(needed, _SURE)) if held < expected else 1.0
-        rows.append(Judged(name, rms, bias, held, expected, max(1.0, of_voxels, *_figures(name, true, of_twin))))
+        rows.append(Judged(name, rms, bias, held, expected, max(1.0, of_voxels, *_statistics(name, true, of_twin))))
     return tuple(rows)
 
 
@@ -85,12 +85,12 @@ def _believed(
     return max(0.0, share - float(ndtri(_SURE)) * float(np.sqrt(share * (1.0 - share) / apart)))
 
 
-def _figures(name: str, true: FloatArray, of_twin: Uncertainty) -> list[float]:
+def _statistics(name: str, true: FloatArray, of_twin: Uncertainty) -> list[float]:
     """By how much the intervals of a tissue's statistics have to be wider for each to come back within the far end."""
     factors = []
     for interval in of_twin.intervals:
-        if interval.region == name and interval.figure in _FIGURES:
-            off = abs(interval.found - float(np.percentile(true, _FIGURES[interval.figure])))
+        if interval.region == name and interval.statistic in _STATISTICS:
+            off = abs(interval.found - float(np.percentile(true, _STATISTICS[interval.statistic])))
             above = off + interval.found - interval.estimate, interval.high - interval.estimate
             below = off - interval.found + interval.estimate, interval.estimate - interval.low
             factors.append(min(reach / max(now, 1e-9) for reach, now in (above, below)))

@@ -1,4 +1,4 @@
-"""Uncertainty of a map of maximum shear strain by an error table: in each voxel, and of the figures of each tissue."""
+"""Uncertainty of the maximum shear strain by an error table: in each voxel, and of the statistics of each tissue."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,10 +22,10 @@ _DRAWS, _AT_ONCE = 200, 10  # truths, and those that are in memory
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A figure of one tissue, and the interval in which the study's registrations would put the truth."""
+    """A statistic of one tissue, and the interval in which the study's registrations would put the truth."""
 
     region: str
-    figure: str  # such as "p95" or "volume_above_0.3_ml"
+    statistic: str  # such as "p95" or "volume_above_0.3_ml"
     found: float  # as measured
     estimate: float  # median of the truths drawn
     low: float  # their 2.5th and 97.5th percentile, moved away from the estimate by `ErrorTable.widening`
@@ -41,7 +41,7 @@ class Uncertainty:
     sigma : (ni, nj, nk)
         Standard deviation of the maximum shear strain about its bias; NaN where not known.
     intervals : tuple of Interval
-        Of the figures of each tissue.
+        Of the statistics of each tissue.
     table : ErrorTable
         What they were made from.
     regions : mapping of (ni, nj, nk) bool
@@ -86,24 +86,24 @@ def uncertainty_of(
     if not measured:
         return Uncertainty(sigma, (), table, regions, to_bone_mm)
     volumes = [np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0 for where in measured.values()]
-    drawn = _figures_drawn(max_shear, grid.spacing_mm, measured, volumes, to_bone_mm, table, seed)
+    drawn = _statistics_drawn(max_shear, grid.spacing_mm, measured, volumes, to_bone_mm, table, seed)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS)]
     intervals = []
-    for (name, where), volume, figures in zip(measured.items(), volumes, drawn, strict=True):
+    for (name, where), volume, statistics in zip(measured.items(), volumes, drawn, strict=True):
         shear, factor = max_shear[where].astype(np.float64), wider.get(name, 1.0)
         sigma[where] = factor * table.expected(name, shear, to_bone_mm[where])[1]
-        low, middle, high = widened(figures, factor * table.factor_of(name))
+        low, middle, high = widened(statistics, factor * table.factor_of(name))
         high[3:] = np.minimum(high[3:], volume)
-        each = zip(names, figures_of(shear, volume), middle, low, high, strict=True)
-        intervals += [Interval(name, figure, *map(float, numbers)) for figure, *numbers in each]
+        each = zip(names, statistics_of(shear, volume), middle, low, high, strict=True)
+        intervals += [Interval(name, statistic, *map(float, numbers)) for statistic, *numbers in each]
     return Uncertainty(sigma, tuple(intervals), table, regions, to_bone_mm)
 
 
-def _figures_drawn(
+def _statistics_drawn(
     max_shear: Float32Array, spacing_mm: FloatArray, measured: Mapping[str, BoolArray], volumes_ml: Sequence[float],
     to_bone_mm: Float32Array, table: ErrorTable, seed: int,
 ) -> FloatArray:  # fmt: skip
-    """Figures of each tissue (tissues, draws, figures) in the truths drawn for some of their voxels."""
+    """Statistics of each tissue (tissues, draws, statistics) in the truths drawn for some of their voxels."""
     body = np.any(list(measured.values()), axis=0)
     apart = _voxels_apart(body, table.correlation_mm / _STEPS_OF_VOXELS / spacing_mm)
     at = [_some_of(where, apart) for where in measured.values()]
@@ -113,11 +113,11 @@ def _figures_drawn(
     points, shear = np.stack(every, axis=1) * spacing_mm, max_shear[every].astype(np.float64)
     draws = TruthDraws(points, shear, tissue, to_bone_mm[every], table, seed, np.array(apart) * spacing_mm)
 
-    def figures(truth: FloatArray) -> list[FloatArray]:
-        return [figures_of(*tissue) for tissue in zip(np.split(truth, ends[:-1]), volumes_ml, strict=True)]
+    def statistics(truth: FloatArray) -> list[FloatArray]:
+        return [statistics_of(*tissue) for tissue in zip(np.split(truth, ends[:-1]), volumes_ml, strict=True)]
 
-    with ThreadPoolExecutor(1) as beside:  # figures of one truth while the next is drawn
-        few = (beside.map(figures, (draws.drawn() for _ in range(_AT_ONCE))) for _ in range(_DRAWS // _AT_ONCE))
+    with ThreadPoolExecutor(1) as beside:  # statistics of one truth while the next is drawn
+        few = (beside.map(statistics, (draws.drawn() for _ in range(_AT_ONCE))) for _ in range(_DRAWS // _AT_ONCE))
         drawn = [each for some in few for each in some]
     return np.swapaxes(drawn, 0, 1)
 
@@ -137,16 +137,16 @@ def _some_of(where: BoolArray, apart: Sequence[int]) -> tuple[IntArray, ...]:
     return np.nonzero(on_lattice if np.count_nonzero(on_lattice) >= _FEW else where)
 
 
-def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float] = SHEAR_THRESHOLDS) -> FloatArray:
+def statistics_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float] = SHEAR_THRESHOLDS) -> FloatArray:
     """Median, 90th and 95th percentile, and the volumes above thresholds (mL) of a tissue of a volume."""
     above = [volume_ml * np.count_nonzero(shear > t) / len(shear) for t in thresholds]
     return np.array([*np.percentile(shear, [50.0, 90.0, 95.0]), *above])
 
 
 def widened(drawn: FloatArray, factor: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Lower end, median and upper end of draws (n, figures): 2.5th and 97.5th percentile, ``factor`` times as far out.
+    """Lower end, median and upper end of draws (n, statistics): 2.5th and 97.5th percentile, ``factor`` times as far.
 
-    No figure of a shear is below zero.
+    No statistic of a shear is below zero.
     """
     low, middle, high = np.percentile(drawn, [2.5, 50.0, 97.5], axis=0)
     return np.maximum(middle - factor * (middle - low), 0.0), middle, middle + factor * (high - middle)

@@ -22,7 +22,7 @@ class Verdict:
     level : {"trust", "caution", "distrust"}
         From the best to the worst; in words "Trust", "Use with care", "Do not trust".
     reasons : tuple of str
-        Full sentences, each with a figure and its limits; at least one reason unless the level is "trust".
+        Full sentences, each with a value and its limits; at least one reason unless the level is "trust".
 
     Raises
     ------

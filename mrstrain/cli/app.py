@@ -24,8 +24,8 @@ mrstrain measures strain inside soft tissue from pairs of MR images, and compare
 models with it.
 
   mrstrain demo       see it work: a phantom heel, from images to report, in a few minutes
-  mrstrain register   measure strain between your own images, unloaded and loaded
-  mrstrain compare    compare finite-element models with the strain that was measured
+  mrstrain init       set up a study of your own images and models, which mrstrain run then computes
+  mrstrain register   measure strain between two of your images, unloaded and loaded, without a study
 
 mrstrain --help lists all commands, and mrstrain COMMAND --help the options of one."""
 _M_ARENA_MAX = -8  # of glibc's malloc.h

@@ -1,9 +1,10 @@
 """`compare`: comparison of finite-element models of any code with a measurement, from files to a report."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, 
 from dvc.measurement.subject import bones_of
 from dvc.report.page import Section
 from dvc.threads import usable_cores
-from dvc.worker import side_by_side
+from dvc.worker import Each, side_by_side
 from fe import read_tet_mesh
 from mrstrain.comparison.credibility import Holdings, credibility_section
 from mrstrain.comparison.from_record import fill_directions, fill_labels, taken_from_record
@@ -104,7 +105,7 @@ def compare(
     if not bones:
         names, name = ", ".join(tissues.names.values()), "Name a bone among them (--bone)."
         tell(NOTE, f"No label is named like a bone: {names} are compared as soft tissue. {name}", 0.0)
-    thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
+    thresholds = validate.read_thresholds(comparison.thresholds)
     criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     pairs = {load: (of.plate_normal, of.shear_direction) for load, of in of_load.items()} | dict(towards or {})
     axes, own = _axes(usual.plate_normal, usual.shear_direction), {load: _axes(*of) for load, of in pairs.items()}
@@ -138,21 +139,32 @@ def compare(
     }  # fmt: skip
     folders, of_models = {load: m.folder for load, m in compared.items()}, {file.name: file.path for file in results}
     with side_by_side("comparing", _at_once(len(cases))) as each:
+        reading_each, comparing_each, writing_each = (
+            partial(_told, each, partial(tell, "compare", what)) for what in ("reading", "comparing", "writing")
+        )
         # Every file is read once before anything is removed, and again when needed: together they would fill memory.
-        warnings = validate.check_models(cases, tissues, bones, each=each)
+        warnings = validate.check_models(cases, tissues, bones, each=reading_each)
         with output_folder(target), alone(target):
             record = provenance("compare", inputs, given)
             result = validate.compare(
-                cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings, progress=share,
-                each=each,
+                cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings,
+                each=comparing_each,
             )  # fmt: skip
             said = methods(folders, of_models, result, criteria)
             held = [credibility_section(Holdings.of(result, {name: path.parent for name, path in of_models.items()}))]
             parts = result.write(
-                target, record=record, methods=said, more=held, on_image=comparison.on_image, each=each
+                target, record=record, methods=said, more=held, on_image=comparison.on_image, each=writing_each
             )
-    share(1.0)
     return Compared(target, result, *parts, taken if progress is None else ())
+
+
+def _told(each: Each, tell: Callable[[float], None], task: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    """The results of ``each``, and the fraction that is done."""
+    those = list(items)
+    tell(0.0)
+    for done, result in enumerate(each(task, those), start=1):
+        tell(done / len(those))
+        yield result
 
 
 def _at_once(loads: int) -> int:

@@ -130,8 +130,8 @@ def _labels(made: Mapping[str, Any] | None) -> str:
     if not made:
         return ""
     how = "from the unloaded image by mrstrain: skin by a layer model of the brightness below the surface, bones by a"
-    unsure = f"{100.0 * made['unsure']:.0f} % of its voxels had a probability below 90 %"
-    return f" The label map was made {how} watershed, and fat and muscle by total variation (Chambolle 2005); {unsure}."
+    doubt = f"{100.0 * made['uncertain']:.0f} % of its voxels had a probability below 90 %"
+    return f" The label map was made {how} watershed, and fat and muscle by total variation (Chambolle 2005); {doubt}."
 
 
 def _files(record: Record) -> str:

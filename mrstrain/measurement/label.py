@@ -77,7 +77,7 @@ def label(
         made = label_tissues(image, bone, body, marks, tell)
     names = tuple(made.labels.names.values())
     inputs = {"load0": source, **{role: of[0] for role, of in (masks.files | strokes.files | drawn.files).items()}}
-    found = {"unsure": made.unsure, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
+    found = {"uncertain": made.uncertain, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
     with files.alone():
         write_labels(files.labels, made.labels)
         write_vectors(
@@ -89,13 +89,13 @@ def label(
         record = provenance("label", inputs, {}) | found | {"labels_sha256": file_hash(files.labels)}
         write_json(files.beside(".json"), record)
     volumes = volumes_ml(made.labels)
-    unsure = f"{100 * made.unsure:.0f} % of the voxels have an uncertain label (probability below 90 %)"
+    uncertain = f"{100 * made.uncertain:.0f} % of the voxels have an uncertain label (probability below 90 %)"
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
-    lines = (told, f"{unsure}; {files.picture} shows where.", *made.notes, f"Label map: {files.labels}")
+    lines = (told, f"{uncertain}; {files.picture} shows where.", *made.notes, f"Label map: {files.labels}")
     made_from = f"Label map made from {'another subject' if drawn.paths else 'the image'}"
     table = Table("Volumes", ("tissue", "volume, mL"), tuple(volumes.items()))
-    section = Section(made_from, None, (table,), (picture,), (f"{unsure}.", *made.notes), pictures_first=True)
-    return Labelled(files.labels, lines, headline=f"{', '.join(volumes)}; {unsure}", section=section)
+    section = Section(made_from, None, (table,), (picture,), (f"{uncertain}.", *made.notes), pictures_first=True)
+    return Labelled(files.labels, lines, headline=f"{', '.join(volumes)}; {uncertain}", section=section)
 
 
 def _from_another(

@@ -33,7 +33,7 @@ class Row:
     """A quantity of one load: its value on each mesh, and the extrapolated limit."""
 
     load: str
-    figure: str
+    quantity: str
     values: tuple[float, ...]
     limit: Limit
 
@@ -53,7 +53,7 @@ class Converged:
             values, of = ", ".join(f"{v:.4g}" for v in row.values), row.limit
             tends = f"limit {of.limit:.4g} (order {of.order:.1f}), error of the finest mesh {of.error:+.1%}"
             tends = tends if np.isfinite(of.limit) else "no limit can be determined"
-            lines.append(f"{row.load}, {row.figure}: {values}; {tends}")
+            lines.append(f"{row.load}, {row.quantity}: {values}; {tends}")
         return [*lines, f"Results: {self.out}"]
 
 
@@ -168,7 +168,7 @@ def _record_variant(done: Converged, simulated: Sequence[Path]) -> None:
     coarse, fine = simulated[second], simulated[finest]
     for folder in done.out.glob("simulated-*"):
         (folder / fine.name / VARIANT).unlink(missing_ok=True)
-    orders = [row.limit.order for row in done.rows if row.figure.startswith(_SHEAR) and np.isfinite(row.limit.order)]
+    orders = [row.limit.order for row in done.rows if row.quantity.startswith(_SHEAR) and np.isfinite(row.limit.order)]
     of_order = (float(np.median(orders)), fe.SAFETY) if orders else (fe.ASSUMED_ORDER, fe.SAFETY_WITHOUT_ORDER)
     steps = fe.mesh_steps(ratios[second], *of_order)
     write_whole(coarse / VARIANT, VariantRecord.of_folders(fine.name, MESH, steps, fine, coarse).text)
@@ -179,11 +179,11 @@ def _write(done: Converged, edges: Sequence[float], record: dict[str, object]) -
     for row in done.rows:
         limit = {of: value if np.isfinite(value) else None for of, value in asdict(row.limit).items()}
         rows.append(asdict(row) | {"limit": limit})
-        table.append([row.load, row.figure, *row.values, *limit.values()])
-    head = ["load", "figure", *(f"edge_{e:g}_mm" for e in edges), "limit", "order", "scatter", "error_of_finest"]
+        table.append([row.load, row.quantity, *row.values, *limit.values()])
+    head = ["load", "quantity", *(f"edge_{e:g}_mm" for e in edges), "limit", "order", "scatter", "error_of_finest"]
     sizes = ["all", "size of the cells, mm", *done.sizes_mm, *([None] * len(fields(Limit)))]
     write_csv(out / "convergence.csv", head, [*table, sizes])
-    curves = {(r.load, r.figure): (r.values, r.limit) for r in done.rows if np.isfinite(r.limit.limit)}
+    curves = {(r.load, r.quantity): (r.values, r.limit) for r in done.rows if np.isfinite(r.limit.limit)}
     for earlier in figure_files(out / "convergence"):
         earlier.unlink(missing_ok=True)
     if curves:

@@ -1,7 +1,6 @@
 """The Dask cluster on which stages run: the cores of this machine by default, or an existing cluster."""
 
 import logging
-import multiprocessing
 import queue
 import signal
 import time
@@ -10,30 +9,27 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import dask
 import psutil
-from distributed import Client, Future, LocalCluster, Nanny, get_worker
+from distributed import Client, Future, KilledWorker, LocalCluster, Nanny, get_worker
 from filelock import FileLock
 
-from dvc.errors import InputError, MrstrainError, WorkerError
+from dvc.errors import MrstrainError, WorkerError
 from dvc.memory import hand_memory_back, is_lack_of_memory
-from dvc.software import software_key
 from dvc.threads import on_one_core, usable_cores
 from mrstrain.records.outcome import lack_of_machine
 from mrstrain.records.progress import NOTE, OnProgress, duration
 from mrstrain.studies import stages
+from mrstrain.studies.scheduler import at_address
 from mrstrain.studies.stages import StageResult
 
 _TELL_EVERY_S = 1.0
 _A_FAULT = "This is an error in mrstrain; please report it:\n"
 _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
-_CONNECT_S, _WORKERS_S = 10.0, 60.0
 _NOTHING_LOGGED = logging.CRITICAL + 1  # by Dask, as of each message that there is no memory for: stages tell of theirs
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
 _STARTS_S = 900.0  # for a worker whose process starts: over two minutes where ten others want the same core
@@ -42,7 +38,7 @@ _SILENT_S, _SILENT_TIMES = 3600.0, 10.0
 _NAME_EVERY_S = 600.0  # a stage that tells nothing new
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts its own processes
-    "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
+    "distributed.scheduler.allowed-failures": 0,  # a stage that ends a worker is tried once more here, not by Dask
     # Workers that were not heard of for minutes by the clock would be ended: on a machine that slept, on one that has
     # too much to do, and when the clock is set. A stage that hangs is noticed by what it tells.
     "distributed.scheduler.worker-ttl": None,
@@ -153,8 +149,9 @@ class StageRunner:
         name = call.name
         self._silent_s.pop(name, None)
         error = future.exception() if future.status == "error" else None
-        if future.status == "finished" or is_lack_of_memory(error):  # of the worker itself
-            outcome, seconds = (WorkerError(lack_of_machine(error)), 0.0) if error else future.result()
+        death = None if error is None else _death(error)
+        if future.status == "finished" or death:
+            outcome, seconds = (death, 0.0) if death else future.result()
             if not isinstance(outcome, WorkerError):
                 lines = (f"{_TRIED} {call.died}",) if call.died else ()
                 again = isinstance(outcome, StageResult) and lines
@@ -166,8 +163,7 @@ class StageRunner:
             return self.next()
         if error is None:
             return name, f"The connection to the scheduler was lost, or it cancelled the stage ({future.status}).", 0.0
-        advice = "The usual cause is too little memory: use fewer workers, or machines with more memory."
-        return name, f"The worker of this stage stopped more than once ({error}). {advice}", 0.0
+        return name, f"Its worker failed ({error}). Run the study again; finished stages are kept.", 0.0
 
     def _hung(self) -> "Future[Any] | None":
         """A stage that has told nothing new for too long, if there is one; those that may become one are named."""
@@ -217,6 +213,16 @@ class StageRunner:
         return bool(self._under_way or self._died)
 
 
+def _death(error: BaseException) -> WorkerError | None:
+    """The death of a worker, or its lack of memory, if that is why its stage has failed."""
+    if isinstance(error, KilledWorker):
+        return WorkerError(
+            "Its worker process died: the system ended it, most often for lack of memory, or native code crashed. Use "
+            "fewer workers, or machines with more memory."
+        )
+    return WorkerError(lack_of_machine(error)) if is_lack_of_memory(error) else None
+
+
 @contextmanager
 def cluster(
     watch: OnProgress, places: Sequence[Path], *, scheduler: str | None = None, workers: int | None = None
@@ -235,42 +241,12 @@ def cluster(
                 client.run(_ignore_interrupts)
                 yield StageRunner(client, watch, local)
             return
-        _refuse_unencrypted(scheduler)
-        try:
-            client = _ClosedIfRefused(scheduler, timeout=_CONNECT_S)
-        except (OSError, ValueError, TypeError) as error:  # the last without certificates
-            raise InputError(
-                f"No Dask scheduler answers at {scheduler} ({error}). Start one as described in docs/cluster.md."
-            ) from error
-        with client:
-            try:
-                client.wait_for_workers(1, timeout=_WORKERS_S)
-            except TimeoutError as none:
-                raise InputError(
-                    f"The scheduler at {scheduler} has no workers after {_WORKERS_S:.0f} s. Start workers as described "
-                    "in docs/cluster.md."
-                ) from none
-            _refuse_unfit(client, scheduler, places)
+        with at_address(scheduler, places) as client:
             runner = StageRunner(client, watch)
             try:
                 yield runner
             finally:
                 client.cancel(list(runner._under_way))
-
-
-class _ClosedIfRefused(Client):
-    """A client that is closed where it cannot connect, such as without a certificate.
-
-    Dask leaves that to the garbage collector. Where this happens while the thread of another client or cluster starts,
-    both wait for one lock, and that start fails after 10 s.
-    """
-
-    def __init__(self, address: str, timeout: float) -> None:
-        try:
-            super().__init__(address, timeout=timeout)
-        except BaseException:
-            self.close()
-            raise
 
 
 @contextmanager
@@ -292,21 +268,6 @@ def _of_this_machine(workers: int) -> Iterator[tuple[LocalCluster, Client]]:
             local.close()
         except TimeoutError:  # a worker that lacks memory may not end when it is asked to
             _kill_workers(local)
-
-
-def _refuse_unencrypted(address: str) -> None:
-    """InputError for a scheduler on a network without TLS: whoever reaches it runs code as its user."""
-    scheme, _, place = address.rpartition("://")
-    try:
-        host = urlsplit(f"//{place}").hostname or ""
-        own = host == "localhost" or ip_address(host).is_loopback
-    except ValueError:  # a name, or no address
-        own = False
-    if not own and scheme != "tls":
-        raise InputError(
-            f"{address}: whoever reaches a Dask scheduler without TLS can run code as its user. Start scheduler and "
-            "workers with TLS, as described in docs/cluster.md, and give its address as tls://HOST:PORT."
-        )
 
 
 def _ignore_interrupts() -> None:
@@ -337,38 +298,6 @@ def _kill(processes: Sequence[psutil.Process]) -> None:
         with suppress(psutil.Error):
             if not any(_TRACKER in word for word in process.cmdline()):
                 process.kill()
-
-
-def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
-    tokens = [out / f".seen-{uuid.uuid4().hex}" for out in places]
-    for token in tokens:
-        token.touch()
-    try:
-        answers = client.run(_about, [str(token) for token in tokens])
-    except ImportError as error:
-        raise InputError(
-            f"mrstrain is not installed for the workers at {address} ({error}). Start them in its environment."
-        ) from error
-    finally:
-        for token in tokens:
-            token.unlink(missing_ok=True)
-    here = software_key("mrstrain").split(", ")
-    for worker, (key, daemon, seen) in answers.items():
-        threads, there = client.nthreads().get(worker, 1), key.split(", ")
-        theirs, ours = (", ".join(p for p in one if p not in rest) for one, rest in ((there, here), (here, there)))
-        for unfit, why in (
-            (there != here, f"has {theirs}, but this machine has {ours}. Start workers in the same environment."),
-            (not seen, f"has no access to {places[0]}. A study must be on a file system that all machines share."),
-            (threads > 1, f"runs {threads} stages at the same time; each needs its own process. Use --nthreads 1."),
-            (daemon, "may not start processes. Set DASK_DISTRIBUTED__WORKER__DAEMON=False in its environment."),
-        ):
-            if unfit:
-                raise InputError(f"The worker {worker} {why}")
-
-
-def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
-    seen = all(Path(token).exists() for token in tokens)
-    return software_key("mrstrain"), multiprocessing.current_process().daemon, seen
 
 
 def _run(topic: str, call: _Call) -> tuple[StageResult | WorkerError | str, float]:

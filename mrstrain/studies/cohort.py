@@ -52,7 +52,7 @@ class Cohort:
             lines.append("Normalised area of each model, mean over the subjects and 95 % interval:")
         lines += [
             f"{place}. {s.model}: {100 * s.mean:z.2f} % ({100 * s.low:z.2f} to {100 * s.high:z.2f}), best in "
-            f"{s.nearest_in} of {s.subjects} subjects"
+            f"{s.best_in} of {s.subjects} subjects"
             + ("" if place == 1 or s.differs_from_best else "; not distinguishable from rank 1")
             for place, s in enumerate(self.ranking, start=1)
         ]
@@ -202,7 +202,7 @@ def _sections(
         ("model", "mean, %", "95 % from", "to", "smallest", "largest", "best in", "subjects", "difference to rank 1, %",
          "95 % from", "to", "significant"),
         tuple(
-            (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.nearest_in,
+            (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.best_in,
              s.subjects, 100 * s.behind, 100 * s.behind_low, 100 * s.behind_high,
              "–" if at == 0 else "yes" if s.differs_from_best else "no")
             for at, s in enumerate(ranking)

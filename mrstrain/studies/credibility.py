@@ -64,7 +64,7 @@ def _converged(record: Mapping[str, Any], labels: str) -> str:
             return ""
         largest: dict[str, float | None] = {}
         for row in record["rows"]:
-            figure, error = str(row["figure"]), row["limit"]["error"]
+            figure, error = str(row["quantity"]), row["limit"]["error"]
             known = largest.setdefault(figure, error)
             larger = None not in (known, error) and abs(error) > abs(known or 0.0)
             largest[figure] = error if error is None or larger else known

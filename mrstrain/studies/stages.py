@@ -17,8 +17,11 @@ from mrstrain.records.progress import NOTE
 
 _M = TypeVar("_M", bound=Options)
 Tell = Callable[[str, float], None]
-_REGISTERING = {"aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2)}
-# of a registration's time: when each of its parts begins, and how much of it the part takes
+_PARTS = {
+    "aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2),
+    "reading": (0.0, 0.1), "comparing": (0.1, 0.5), "writing": (0.6, 0.4),
+}  # fmt: skip
+# of the time of a registration or a comparison: when each of its parts begins, and how much of it the part takes
 _LEFT_OUT = (
     "The variants for the input uncertainty of the models were skipped (quick): intervals and significant "
     "differences take mesh, forces, directions and parameters of simulated models as exact."
@@ -61,12 +64,12 @@ def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **o
 
 
 def _whole(tell: Tell) -> Tell:
-    """Progress of the parts of a registration as that of the whole; a part without a known share leaves it as it is."""
+    """Progress of parts as that of the whole; a part without a known share leaves it as it is."""
     reached = 0.0
 
     def told(part: str, fraction: float) -> None:
         nonlocal reached
-        begin, share = _REGISTERING.get(part, (reached, 0.0))
+        begin, share = _PARTS.get(part, (reached, 0.0))
         reached = max(reached, begin + share * fraction)
         tell(part, reached)
 
@@ -163,8 +166,9 @@ def compare(tell: Tell, **options: Any) -> StageResult:
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
     variants = [*options.pop("variants", []), *options.pop("variants_elsewhere", [])]
     remarks = [_LEFT_OUT] if options.pop("quick", False) else []
+    whole = _whole(tell)
     done = run(
-        options.pop("dvc"), models, variants=variants, remarks=remarks, progress=lambda _, *stage: tell(*stage),
+        options.pop("dvc"), models, variants=variants, remarks=remarks, progress=lambda _, *stage: whole(*stage),
         **options,
     )  # fmt: skip
     return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing, headline=done.comparison.headline)

@@ -79,9 +79,9 @@ def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: py
     assert made == sorted(counts, reverse=True)
     with (tmp_path / "study" / "convergence.csv").open(newline="") as file:
         travel, *_, sizes = csv.DictReader(file)
-    assert (sizes["load"], sizes["figure"], sizes["limit"]) == ("all", "size of the cells, mm", "")
+    assert (sizes["load"], sizes["quantity"], sizes["limit"]) == ("all", "size of the cells, mm", "")
     assert float(sizes["edge_6_mm"]) > 0.0
-    assert travel["figure"] == "plate displacement, mm"
+    assert travel["quantity"] == "plate displacement, mm"
     values = [float(travel[f"edge_{edge:g}_mm"]) for edge in counts]
     assert values == sorted(values)  # finer meshes are softer
     assert len(set(values)) == 3
@@ -105,7 +105,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert "Cell sizes, mm" in done.output
     with (out / "convergence.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["figure"] for row in rows][:2] == ["plate displacement, mm", "maximum shear strain of fat, p50"]
+    assert [row["quantity"] for row in rows][:2] == ["plate displacement, mm", "maximum shear strain of fat, p50"]
     assert 0.1 < float(rows[0]["edge_1.6_mm"]) < 10.0
     for ending in ("png", "pdf"):
         assert any(row["limit"] for row in rows) == (out / f"convergence.{ending}").is_file()

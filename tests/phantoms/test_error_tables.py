@@ -172,7 +172,7 @@ def test_coverage_judges_each_heel_by_the_others() -> None:
     fat = {r.tissue: r for r in coverage_rows(alike)}["fat"]
     assert fat.voxels_within == pytest.approx(0.95, abs=0.02)
     assert abs(fat.left_over) < 0.004
-    assert fat.figures_within == pytest.approx(0.95, abs=0.05)  # widened until it is
+    assert fat.statistics_within == pytest.approx(0.95, abs=0.05)  # widened until it is
     (table,) = fit_error_model(alike, "", "").tables
     assert 1.0 < table.widening < 10.0
     assert np.isnan(fit_error_model(alike[:1], "", "").tables[0].widening)
@@ -196,10 +196,10 @@ def test_intervals_hold_for_a_motion_that_was_left_out() -> None:
     assert table.widening > 1.3 * fit_error_model(by_heel, "", "").tables[0].widening
     new = [samples(replace(CASE, motion="other", seed=9), sd=0.01, count=20_000, offset=o) for o in (0.025, -0.025)]
     (row,) = (r for r in coverage_rows(new, fit_error_model(runs, "", "")) if r.tissue == "fat")
-    assert row.figures_within == 1.0
+    assert row.statistics_within == 1.0
     as_drawn = fit_error_model(runs, "", "")
     as_drawn = replace(as_drawn, tables=(replace(table, widening=1.0),))
-    assert next(r for r in coverage_rows(new, as_drawn) if r.tissue == "fat").figures_within < 0.5
+    assert next(r for r in coverage_rows(new, as_drawn) if r.tissue == "fat").statistics_within < 0.5
 
 
 def test_intervals_are_widened_by_motions_of_another_origin() -> None:
@@ -218,7 +218,7 @@ def test_intervals_are_widened_by_motions_of_another_origin() -> None:
     as_drawn = replace(model, tables=(replace(model.tables[0], widening=1.0),))
     for given, least, most in ((widened_for(model, others), 1.0, 1.0), (as_drawn, 0.0, 0.4)):
         (row,) = (r for r in coverage_rows([new], given) if r.tissue == "fat")
-        assert least <= row.figures_within <= most
+        assert least <= row.statistics_within <= most
 
 
 def test_components_err_as_the_samples_do() -> None:

@@ -39,7 +39,7 @@ def test_closed_form():
     # two values: the standard error is half their distance, and t(0.975, 1) = 12.7062
     assert second.high - second.mean == pytest.approx(12.7062 * 0.1, rel=1e-5)
     assert (second.least, second.greatest) == (0.3, 0.5)
-    assert (first.nearest_in, second.nearest_in) == (2, 0)
+    assert (first.best_in, second.best_in) == (2, 0)
     assert second.behind == pytest.approx(0.25)
     # of two models, Tukey's interval is Student's: the two differences are .2 and .3
     assert second.behind_high - second.behind == pytest.approx(12.7062 * 0.05, rel=1e-4)

@@ -99,7 +99,7 @@ def test_the_comparison_error_has_its_closed_form_and_is_told_by_load_tissue_and
     mesh, table = cube(), error_table(0.02, 0.01, widening=2.0)
     result = model("m", mesh, 0.9, force=0.04, poisson=0.03, mesh=-0.02)
     one = compare_load(case("Load1", sheared(0.8), [result], table), labels(), criteria=Criteria(STRAINS))
-    rows = {(e.tissue, e.figure): e for e in one.errors}
+    rows = {(e.tissue, e.statistic): e for e in one.errors}
     assert {tissue for tissue, _ in rows} == {ALL, "fat", "skin"}
     median = rows[ALL, "median"]
     assert median.simulated == pytest.approx(max_shear(0.9))
@@ -119,7 +119,7 @@ def test_the_comparison_error_has_its_closed_form_and_is_told_by_load_tissue_and
     bare = compare_load(
         case("Load1", sheared(0.8), [model("m", mesh, 0.9)], table), labels(), criteria=Criteria(STRAINS)
     )
-    alone = next(e for e in bare.errors if (e.tissue, e.figure) == (ALL, "median"))
+    alone = next(e for e in bare.errors if (e.tissue, e.statistic) == (ALL, "median"))
     assert np.isnan([alone.u_num, alone.u_input]).all()
     assert alone.u_val == pytest.approx(alone.u_d)
     area = rows[ALL, "area"]
@@ -196,7 +196,7 @@ def test_a_figure_that_the_measurement_does_not_show_is_not_counted_as_a_wrong_m
     one = compare_load(
         case("Load1", sheared(1.2), results, error_table(0.0, 0.01)), labels(), criteria=Criteria((0.05, 0.2))
     )
-    rows = {e.figure: e for e in one.errors if e.tissue == ALL}
+    rows = {e.statistic: e for e in one.errors if e.tissue == ALL}
     unknown = [e for name, e in rows.items() if name in ("median", "p95")]
     assert np.isnan([e.error for e in unknown]).all()
     assert not any(e.significant for e in unknown)

@@ -54,7 +54,7 @@ class GaussNewton(Parameters, Engine):
     -----
     `Measurement.sigma` and `.intervals` are available only for the parameters of the error model: `bending` chosen by
     cross-validation, the default spacing and rigidity, and `volume` None or 300. Otherwise
-    `Measurement.error_bars.told` gives the reason. Repeat scans are always registered with a bending of 3/mm.
+    `Measurement.error_bars.explanation` gives the reason. Repeat scans are always registered with a bending of 3/mm.
     """
 
     family = name = "gauss-newton"

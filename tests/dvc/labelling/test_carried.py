@@ -118,7 +118,7 @@ def test_labels_of_another_heel_find_their_places(heels: tuple[Image, LabelMap, 
         assert shares[name] > least, shares
     body = made.labels.labels > 0
     assert np.allclose(made.probability.sum(axis=0)[body], 1.0, atol=1e-3)
-    assert 0.02 < made.unsure < 0.4
+    assert 0.02 < made.uncertain < 0.4
     nameless = LabelMap(labels.grid, labels.labels, {n: f"label-{n}" for n in labels.names})
     with pytest.raises(InputError, match="named like a bone"):
         labels_from(image, other, nameless)

@@ -179,7 +179,7 @@ def test_probabilities_are_as_sure_as_they_are_right(labelled) -> None:
         assert some.sum() > 1000
         assert right[some].mean() > low - 0.1
     assert right[soft & (sure < 0.7)].mean() < 0.8  # what is called unsure is wrong more often
-    assert 0.05 < made.unsure < 0.3
+    assert 0.05 < made.uncertain < 0.3
 
 
 def test_progress_is_told_to_the_end_and_what_does_not_fit_is_refused() -> None:

@@ -140,7 +140,7 @@ def test_what_is_written_is_read_again(measured, written):
         assert (one.region, one.component, one.unit) == (other.region, other.component, other.unit)
         assert list(asdict(one).values())[3:] == pytest.approx(list(asdict(other).values())[3:], rel=1e-5)
     for one, other in zip(again.intervals, measured.intervals, strict=True):
-        assert (one.region, one.figure) == (other.region, other.figure)
+        assert (one.region, one.statistic) == (other.region, other.statistic)
         assert list(asdict(one).values())[2:] == pytest.approx(list(asdict(other).values())[2:], rel=1e-5)
     for row, kept in zip(again.regions, measured.regions, strict=True):
         above = row.volume_above_ml, kept.volume_above_ml
@@ -164,7 +164,7 @@ def test_what_a_twin_did_is_read_again(measured, tmp_path):
     bars = replace(measured.error_bars, twin=rows, of_twin="widened by the synthetic warp of this pair: fat 1.2 times.")
     replace(measured, error_bars=bars).write(tmp_path / "Load1")
     again = dvc.Measurement.read(tmp_path / "Load1").error_bars
-    assert (again.twin, again.of_twin, again.told) == (rows, bars.of_twin, bars.told)
+    assert (again.twin, again.of_twin, again.explanation) == (rows, bars.of_twin, bars.explanation)
 
 
 def test_a_deformation_from_elsewhere_is_a_measurement_too(stretched, tmp_path):

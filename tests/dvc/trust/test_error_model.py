@@ -16,7 +16,7 @@ from dvc.images.depth import to_surface_mm
 from dvc.images.image import Grid
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, read_error_model
 from dvc.trust.truth_draws import GaussianField, TruthDraws
-from dvc.trust.uncertainty import figures_of, uncertainty_of
+from dvc.trust.uncertainty import statistics_of, uncertainty_of
 
 KNOTS = np.array([0.0, 0.1, 0.5])
 FAT = np.array([[[0.02, 0.0, -0.04], [0.01, 0.0, 0.0]], [[0.02, 0.02, 0.06], [0.01, 0.01, 0.01]]])
@@ -202,7 +202,7 @@ def test_intervals_are_widened_from_their_middle_and_stay_possible() -> None:
     assert half[0].high - half[0].estimate == pytest.approx(2.0 * (plain[0].high - plain[0].estimate))
     assert all(i.low >= 0.0 for i in wide)
     volume = everywhere.size * GRID.voxel_volume_mm3 / 1000.0
-    assert all(i.high <= volume for i in wide if i.figure.startswith("volume"))
+    assert all(i.high <= volume for i in wide if i.statistic.startswith("volume"))
 
 
 def test_no_more_than_a_few_truths_are_in_memory_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,10 +216,10 @@ def test_no_more_than_a_few_truths_are_in_memory_at_once(monkeypatch: pytest.Mon
     def slow(shear: np.ndarray, volume_ml: float) -> np.ndarray:
         time.sleep(0.003)
         used.append(None)
-        return figures_of(shear, volume_ml)
+        return statistics_of(shear, volume_ml)
 
     monkeypatch.setattr(TruthDraws, "drawn", counted)
-    monkeypatch.setattr("dvc.trust.uncertainty.figures_of", slow)
+    monkeypatch.setattr("dvc.trust.uncertainty.statistics_of", slow)
     fat = np.zeros(GRID.shape, dtype=bool)
     fat[4:7, 4:7, 4:7] = True
     shear, far = np.full(GRID.shape, 0.2, dtype=np.float32), np.full(GRID.shape, 9.0, dtype=np.float32)
@@ -244,7 +244,7 @@ def test_intervals_cover_the_truth_as_often_as_they_claim() -> None:
         found = 0.25 + 0.08 * base / base.std()
         noise = gaussian_filter(random.standard_normal(GRID.shape), 2.0)
         truth = found - 0.01 - 0.03 * noise / noise.std() - 0.01 * random.normal()
-        actual = figures_of(truth.ravel(), truth.size / 1000.0)
+        actual = statistics_of(truth.ravel(), truth.size / 1000.0)
         row = []
         for one in (table, replace(table, runs=(cells(0.01, 0.03),))):
             got = uncertainty_of(found.astype(np.float32), GRID, {"x": everywhere}, far, one)

@@ -19,7 +19,7 @@ HELP = {name: CliRunner().invoke(app, [name, "--help"], terminal_width=100).outp
 def test_without_arguments_it_greets_with_three_commands_and_not_with_the_whole_help() -> None:
     ran = CliRunner().invoke(app, [])
     assert ran.exit_code == 0
-    assert re.findall(r"^  mrstrain (\w+)", ran.output, re.MULTILINE) == ["demo", "register", "compare"]
+    assert re.findall(r"^  mrstrain (\w+)", ran.output, re.MULTILINE) == ["demo", "init", "register"]
     assert "mrstrain --help" in ran.output
     assert len(ran.output.splitlines()) < 10
     assert "converge" in CliRunner().invoke(app, ["--help"]).output

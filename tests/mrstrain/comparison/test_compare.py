@@ -320,6 +320,10 @@ def test_tissue_without_bone_is_compared_and_its_report_leaves_out_what_needs_bo
     done = compare(study / "measured", models, **only, **given(study))
     assert [a.model for a in done.comparison.ranking.areas] == ["right", "half"]
     assert told[0][0] == "note"
+    assert [part for part in told[1:] if part[0] == "note"] == []
+    assert [part[1:] for part in told[1:]] == [
+        (what, share) for what in ("reading", "comparing", "writing") for share in (0.0, 1.0)
+    ]
     assert "No label is named like a bone: fat, skin are compared as soft tissue." in told[0][1]
     (said,) = [note for note in done.comparison.notes if "no bone" in note]
     assert "all of its labels (fat, skin) are compared as soft tissue" in said

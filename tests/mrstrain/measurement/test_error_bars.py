@@ -99,9 +99,9 @@ def test_where_the_error_is_not_known_the_reason_is_told(used: ErrorModel, label
     found, subject, maps = given(labels, bone)
     bars = bars_of(found, subject, maps, used)
     assert bars.uncertainty is None
-    assert says in bars.told
-    assert bars.as_dict() == {"known": False, "reason": bars.told}
-    assert bars.summary == [f"No error bars: {bars.told}"]
+    assert says in bars.explanation
+    assert bars.as_dict() == {"known": False, "reason": bars.explanation}
+    assert bars.summary == [f"No error bars: {bars.explanation}"]
     assert error_tables(bars) == []
 
 
@@ -118,9 +118,9 @@ def test_a_muscle_named_after_a_bone_is_no_bone() -> None:
 def test_a_model_of_other_voxels_says_so() -> None:
     found, subject, maps = given()
     own = " x ".join(f"{edge:.2g}" for edge in GRID.spacing_mm)
-    assert "these images" not in bars_of(found, subject, maps, model()).told
+    assert "these images" not in bars_of(found, subject, maps, model()).explanation
     tables = [replace(t, spacing_mm=tuple(1.3 * edge for edge in t.spacing_mm)) for t in model().tables]
-    told = bars_of(found, subject, maps, replace(model(), tables=tuple(tables))).told
+    told = bars_of(found, subject, maps, replace(model(), tables=tuple(tables))).explanation
     assert f"(these images: voxels of {own} mm)" in told
 
 
@@ -129,7 +129,7 @@ def test_the_noisier_image_counts() -> None:
     random = np.random.default_rng(1)
     noise = 60.0 * random.standard_normal((2, *GRID.shape))
     found.loaded = Image(GRID, np.hypot(found.reference.values + noise[0], noise[1]).astype(np.float32))
-    assert "too far" in bars_of(found, subject, maps, model()).told
+    assert "too far" in bars_of(found, subject, maps, model()).explanation
 
 
 def test_tissue_outside_the_mask_is_no_air() -> None:
@@ -149,14 +149,14 @@ def test_tissue_outside_the_mask_is_no_air() -> None:
 def test_several_stages_have_no_known_error() -> None:
     found, subject, maps = given()
     found.settings = Settings(Elastix((load_preset("heel-mr"), load_preset("heel-mr"))))
-    assert "several elastix stages" in bars_of(found, subject, maps, model()).told
+    assert "several elastix stages" in bars_of(found, subject, maps, model()).explanation
 
 
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
     found.settings = Settings(Elastix((replace(load_preset("heel-mr"), name="mine"),)))
     bars = bars_of(found, subject, maps, error_model_of("mine"))
-    assert "mine has not been measured" in bars.told
+    assert "mine has not been measured" in bars.explanation
 
 
 def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
@@ -164,13 +164,13 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     found.settings = Settings.of("gauss-newton")
     own = model("gauss-newton", text=found.settings.engine.text)
     assert bars_of(found, subject, maps, own).uncertainty is not None
-    assert "is for heel-mr" in bars_of(found, subject, maps, model()).told
+    assert "is for heel-mr" in bars_of(found, subject, maps, model()).explanation
     found.unlike_study = "This pair is unlike any phantom."
-    assert bars_of(found, subject, maps, own).told == found.unlike_study
+    assert bars_of(found, subject, maps, own).explanation == found.unlike_study
     found.settings = Settings(GaussNewton(bending=2.0))
-    assert "fixed at 2/mm" in bars_of(found, subject, maps, own).told
+    assert "fixed at 2/mm" in bars_of(found, subject, maps, own).explanation
     found.settings, found.unlike_study = Settings(GaussNewtonWithInterfaces()), ""
-    assert "registered with gauss-newton-borders" in bars_of(found, subject, maps, own).told
+    assert "registered with gauss-newton-borders" in bars_of(found, subject, maps, own).explanation
     with_interfaces = model("gauss-newton-borders", text=found.settings.engine.text)
     assert bars_of(found, subject, maps, with_interfaces).uncertainty is not None
 

@@ -52,16 +52,16 @@ def test_everything_is_written_and_agrees(folder: Path) -> None:
     record = json.loads((made / "tissues.json").read_text())
     assert record["command"] == "label"
     assert record["inputs"]["bone"][0]["sha256"]
-    assert 0.0 < record["unsure"] < 0.5
+    assert 0.0 < record["uncertain"] < 0.5
     told = (folder / "told.txt").read_text()
-    assert f"{100 * record['unsure']:.0f} % of the voxels have an uncertain label" in told
+    assert f"{100 * record['uncertain']:.0f} % of the voxels have an uncertain label" in told
     assert told.endswith(f"Label map: {made / 'tissues.nii.gz'}")
 
 
 def test_a_measurement_knows_labels_that_were_made_from_the_image(folder: Path, tmp_path: Path) -> None:
     made = shutil.copytree(folder / "made", tmp_path / "made")
     known = made_from_image(made / "tissues.nii.gz")
-    assert known == LabelsFromImage(json.loads((made / "tissues.json").read_text())["unsure"])
+    assert known == LabelsFromImage(json.loads((made / "tissues.json").read_text())["uncertain"])
     assert not known.doubts
     files = SubjectFiles(bone=folder / "bone.nii.gz", labels=made / "tissues.nii.gz", names=made / "tissues.csv")
     assert read_subject(folder / "Load0.nii.gz", files).from_image == known
@@ -163,7 +163,7 @@ def test_another_subjects_labels_are_carried_over_and_counted_as_made(folder: Pa
     assert np.mean((made.labels != truth.labels)[truth.labels > 0]) < 0.15
     record = json.loads(out.with_name("tissues.json").read_text())
     assert set(record["inputs"]) == {"load0", "labels", "names", "from_image"}
-    assert made_from_image(out) == LabelsFromImage(record["unsure"], tuple(record["notes"]))
+    assert made_from_image(out) == LabelsFromImage(record["uncertain"], tuple(record["notes"]))
     assert out.with_name("tissues_probability.nii.gz").is_file()
 
 

@@ -128,7 +128,7 @@ def test_error_bars_are_those_of_the_model(results, study, tiny_pair):
         np.testing.assert_allclose(sigma[inside], np.interp(shear[inside], [0.0, 0.2], [low, high]), atol=1e-6)
     assert np.isnan(sigma[tiny_pair.bone.inside]).all()
     with (folder / "intervals.csv").open() as file:
-        rows = {(r["region"], r["figure"]): r for r in csv.DictReader(file)}
+        rows = {(r["region"], r["statistic"]): r for r in csv.DictReader(file)}
     fat = rows["fat", "median"]
     assert float(fat["low"]) < float(fat["estimate"]) < float(fat["high"])
     # the bias of 0.01 to 0.02 is taken out

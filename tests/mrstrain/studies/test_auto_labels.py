@@ -53,8 +53,8 @@ def test_the_label_map_is_made_and_measured_with(study):
     page = (study / "results" / "report.html").read_text()
     assert "Label map made from the image" in page
     record = json.loads((study / "results" / "registration" / "Load1" / "provenance.json").read_text())
-    unsure = record["parameters"]["labels_from_image"]["unsure"]
-    assert unsure == json.loads((made / "tissues.json").read_text())["unsure"]
+    unsure = record["parameters"]["labels_from_image"]["uncertain"]
+    assert unsure == json.loads((made / "tissues.json").read_text())["uncertain"]
     assert f"{100 * unsure:.0f} % of its voxels have an uncertain label" in page
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,11 +17,13 @@ import dask
 import psutil
 import pytest
 from distributed.protocol import ToPickle, dumps
+from filelock import FileLock
 
 from dvc.errors import InputError
-from mrstrain.studies.cluster import StageRunner, _refuse_unencrypted, cluster
+from mrstrain.studies.cluster import StageRunner, cluster
 from mrstrain.studies.run import run
-from tests.processes import cluster_of
+from mrstrain.studies.scheduler import _refuse_unencrypted
+from tests.processes import cluster_of, wait_for
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
 
@@ -109,16 +113,36 @@ def of_this_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StageR
         yield runner
 
 
-def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(of_this_machine, tmp_path):
-    mark = str(tmp_path / "tried")
+def test_a_stage_whose_worker_is_killed_is_tried_once_more_when_it_is_alone(tmp_path):
+    """Dask would give it to another worker at once, beside other stages, and name no cause."""
+    told, again = list[tuple[str, str, float]](), ("killed", "once more", 0.0)
+    with cluster(lambda *event: told.append(event), [tmp_path], workers=2) as runner:
 
-    def lost_once() -> str:
-        if not os.path.exists(mark):
-            open(mark, "w").close()
-            os._exit(1)
-        return "done"
+        def kill_its_worker() -> None:
+            places = runner._client.processing().items()
+            (its_worker,) = (address for address, keys in places if any("killed" in key for key in keys))
+            os.kill(runner._client.run(os.getpid, workers=[its_worker])[its_worker], signal.SIGKILL)
 
-    assert of_this_machine._client.submit(lost_once).result(timeout=300) == "done"
+        with FileLock(tmp_path / "held"):
+            with FileLock(tmp_path / "other"):
+                runner.begin("killed", "mesh", {}, tmp_path / "held", gib=1.5)
+                runner.begin("beside", "mesh", {}, tmp_path / "other")
+                wait_for(lambda: {name for name, *_ in told} == {"killed", "beside"})
+                kill_its_worker()
+                ended = ThreadPoolExecutor(1).submit(runner.next)
+                wait_for(lambda: runner._died)
+            assert ended.result(timeout=300)[0] == "beside"
+            assert again not in told
+            ended = ThreadPoolExecutor(1).submit(runner.next)
+            wait_for(lambda: again in told)
+            kill_its_worker()
+            name, outcome, _ = ended.result(timeout=300)
+    assert name == "killed"
+    assert outcome.startswith("Its worker process died: the system ended it, most often for lack of memory")
+    assert outcome.endswith("It was tried twice; by the estimate it needs 1.5 GiB of memory.")
+
+
+def test_freed_arrays_serve_the_next_in_a_worker(of_this_machine):
     kept = of_this_machine._client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_", "freed arrays serve the next")
     assert kept.result(timeout=300) == "freed arrays serve the next"
 
@@ -154,7 +178,7 @@ def test_what_runs_a_study_is_reached_from_this_machine_alone(of_this_machine):
 
 
 def test_a_scheduler_that_is_not_there(images, tmp_path, monkeypatch):
-    monkeypatch.setattr("mrstrain.studies.cluster._CONNECT_S", 1.0)
+    monkeypatch.setattr("mrstrain.studies.scheduler._CONNECT_S", 1.0)
     study = tmp_path / "study"
     shutil.copytree(images, study)
     with pytest.raises(InputError, match="No Dask scheduler"):

@@ -25,7 +25,7 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
     told = cohort(places, out=tmp_path / "cohort")
     assert all(o.reused for one in told.ran for o in one.outcomes.values())
     (first,) = told.ranking
-    assert (first.model, first.subjects, first.nearest_in) == ("akrami", 2, 2)
+    assert (first.model, first.subjects, first.best_in) == ("akrami", 2, 2)
     with (folder / "results" / "comparison" / "areas.csv").open() as file:
         shares = [float(r["share"]) for r in csv.DictReader(file) if r["load"] == "all loads"]
     assert first.mean == pytest.approx(shares[0], rel=1e-5)

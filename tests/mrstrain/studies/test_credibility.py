@@ -120,10 +120,10 @@ def converged(place: Path, labels: Path, **changes: Any) -> None:
         "sizes_mm": [3.0, 2.0, 1.5], "parameters": {"material": "trebbi"},
         "inputs": {"labels": [{"name": labels.name, "sha256": file_hash(labels)}]},
         "rows": [
-            {"load": "Load1", "figure": "p50 of fat", "limit": limit | {"error": -0.02}},
-            {"load": "Load2", "figure": "p50 of fat", "limit": limit | {"error": 0.05}},
-            {"load": "Load1", "figure": "plate", "limit": limit | {"error": 0.01}},
-            {"load": "Load2", "figure": "plate", "limit": limit | {"error": None}},
+            {"load": "Load1", "quantity": "p50 of fat", "limit": limit | {"error": -0.02}},
+            {"load": "Load2", "quantity": "p50 of fat", "limit": limit | {"error": 0.05}},
+            {"load": "Load1", "quantity": "plate", "limit": limit | {"error": 0.01}},
+            {"load": "Load2", "quantity": "plate", "limit": limit | {"error": None}},
         ],
     } | changes  # fmt: skip
     (place / "convergence.json").write_text(json.dumps(record))

@@ -25,10 +25,10 @@ from tests.fe.test_meshing import half_onion
 from tests.fe.test_simulate import dome
 from tests.processes import is_gone, under_way, wait_for
 
-COMPUTED_S, OVER_S = 20.0, 120.0
+COMPUTED_S, SAID_S, OVER_S = 20.0, 15.0, 50.0
 """What a command may compute after an interrupt, seconds of processor time, which other programs make hardly longer;
-and the time until it is over, which they do. On a machine that has nothing else to do it is over in two seconds, unless
-a loop is compiled for the first time at that moment, which takes up to ten."""
+and the times until it says so and until it is over, which they do. On a machine that has nothing else to do it is over
+in two seconds, unless a loop is compiled for the first time at that moment, which takes up to ten."""
 
 slow = partial(pytest.param, marks=pytest.mark.full_size)  # each command has one of process and group in `make test`
 
@@ -49,8 +49,12 @@ def interrupted(
         before = computed_s(family)
         (os.killpg if group else os.kill)(process.pid, by)
         began, after = time.monotonic(), dict(before)
+        said = by != signal.SIGINT
         while process.poll() is None or not all(is_gone(one.pid) for one in below):
-            assert time.monotonic() - began < OVER_S, "it is not over"
+            passed = time.monotonic() - began
+            said = said or "Stopping." in err.read_text()
+            assert said or passed < SAID_S, "it did not say so in time"
+            assert passed < OVER_S, "it is not over"
             after |= computed_s(family)
             time.sleep(0.05)
         assert sum(after.values()) - sum(before.values()) < COMPUTED_S, "it went on"

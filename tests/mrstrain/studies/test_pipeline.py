@@ -11,11 +11,11 @@ import pytest
 
 from dvc.errors import InputError
 from dvc.software import distribution_versions, software_key
-from mrstrain.studies.cluster import _refuse_unfit
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline, run_all
 from mrstrain.studies.plan import Stage
 from mrstrain.studies.run import refuse_unknown
+from mrstrain.studies.scheduler import _refuse_unfit
 from mrstrain.studies.stages import StageResult
 
 
