@@ -82,7 +82,7 @@ class StageRunner:
 
     def __init__(self, client: Client, watch: OnProgress, local: LocalCluster | None = None) -> None:
         self._client, self._watch = client, watch
-        self._nannies: Mapping[Any, Nanny] = local.workers if local is not None else {}  # of workers for this run alone
+        self._local = local  # of workers for this run alone
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
@@ -137,7 +137,7 @@ class StageRunner:
                 lost_since = None if left else lost_since or time.monotonic()
                 lost_s = 0.0 if lost_since is None else time.monotonic() - lost_since
                 answers = self._client.status == "running"
-                starts = answers and lost_s > _LOST_S and any(map(_processes_of, self._nannies.values()))
+                starts = answers and lost_s > _LOST_S and any(map(_processes_of, self._nannies))
                 if lost_s > (_STARTS_S if starts else _LOST_S):
                     future = next(iter(self._under_way))
                     return self._under_way.pop(future).name, "The scheduler, or every worker, has stopped.", 0.0
@@ -192,7 +192,7 @@ class StageRunner:
         cancelled = [future for future in self._under_way if future.key in held]
         calls = [self._under_way.pop(future) for future in cancelled]
         self._client.cancel(cancelled)
-        for nanny in self._nannies.values():
+        for nanny in self._nannies:
             if nanny.worker_address in places:  # what hangs in native code would not notice that its worker is gone
                 _kill(_processes_of(nanny)[1:])
         self._client.restart_workers([*places], raise_for_error=False)
@@ -206,6 +206,15 @@ class StageRunner:
             "study again; finished stages are kept.",
             silent_s,
         )
+
+    @property
+    def _nannies(self) -> list[Nanny]:
+        return [] if self._local is None else [*self._local.workers.values()]
+
+    def keep(self, workers: int) -> None:
+        """End workers of this machine beyond a number, as more have nothing left to do: each holds 0.3 GiB."""
+        if self._local is not None and 0 < workers < len(self._local.workers):
+            self._local.scale(workers)
 
     @property
     def busy(self) -> bool:

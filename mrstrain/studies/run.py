@@ -12,6 +12,7 @@ from pathlib import Path
 from dvc import Verdict
 from dvc.errors import InputError, ParameterError, few
 from dvc.io.result_folder import REPORT
+from dvc.memory import hand_memory_back
 from dvc.threads import usable_cores
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
@@ -165,6 +166,7 @@ def run_studies(
                 pipelines[prefix].gib = {stage.name: gib_of(stage, study, voxels, cells) for stage in left}
                 if scheduler is None:
                     _tell(costs(study, stages, left, voxels, cells, at_once), log)
+        hand_memory_back()  # of the images that were checked
         with watch.reporting():
             run_all(pipelines, pool, logs, watch.ended)
         runs = [StudyRun(study, pipelines[prefix].in_order()) for prefix, study in named.items()]

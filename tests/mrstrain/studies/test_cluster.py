@@ -142,6 +142,25 @@ def test_a_stage_whose_worker_is_killed_is_tried_once_more_when_it_is_alone(tmp_
     assert outcome.endswith("It was tried twice; by the estimate it needs 1.5 GiB of memory.")
 
 
+def test_a_worker_that_has_nothing_left_to_do_is_ended_and_the_other_goes_on(tmp_path):
+    told = list[tuple[str, str, float]]()
+    with cluster(lambda *event: told.append(event), [tmp_path], workers=2) as runner:
+        runner.keep(2)
+        assert len(runner._client.nthreads()) == 2
+        with FileLock(tmp_path / "held"):
+            runner.begin("last", "mesh", {}, tmp_path / "held")
+            wait_for(lambda: told)
+            runner.keep(1)
+            wait_for(lambda: len(runner._client.nthreads()) == 1)
+            wait_for(lambda: len(runner._nannies) == 1)
+        name, outcome, _ = runner.next()
+        assert name == "last"
+        assert "missing" in outcome  # what it needs was not given, and it was not begun again
+        assert told == [("last", "begun", 0.0)]
+        runner.keep(0)
+        assert len(runner._client.nthreads()) == 1
+
+
 def test_freed_arrays_serve_the_next_in_a_worker(of_this_machine):
     kept = of_this_machine._client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_", "freed arrays serve the next")
     assert kept.result(timeout=300) == "freed arrays serve the next"
