@@ -82,7 +82,7 @@ class StageRunner:
 
     def __init__(self, client: Client, watch: OnProgress, local: LocalCluster | None = None) -> None:
         self._client, self._watch = client, watch
-        self._local = local  # of workers for this run alone
+        self._local, self._left = local, 0  # workers for this run alone; stages left, if known
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
@@ -129,6 +129,7 @@ class StageRunner:
                 future = self._finished.get(timeout=_LOOK_EVERY_S)
                 break
             except queue.Empty:
+                self._end_idle_workers()
                 # Dask tells the end of a stage in a thread of its own, which there may be no memory for.
                 if ended := [one for one in self._under_way if one.done()]:
                     future = ended[0]
@@ -211,10 +212,17 @@ class StageRunner:
     def _nannies(self) -> list[Nanny]:
         return [] if self._local is None else [*self._local.workers.values()]
 
-    def keep(self, workers: int) -> None:
-        """End workers of this machine beyond a number, as more have nothing left to do: each holds 0.3 GiB."""
-        if self._local is not None and 0 < workers < len(self._local.workers):
-            self._local.scale(workers)
+    def keep(self, left: int) -> None:
+        """Keep no more workers of this machine than stages are left, once these have begun: each holds 0.3 GiB."""
+        self._left = left
+
+    def _end_idle_workers(self) -> None:
+        begun = sum(call.name in self._silent_s for call in self._under_way.values())
+        if self._local is None or not 0 < begun == self._left:
+            return
+        if idle := [one for one, keys in self._client.processing().items() if not keys]:
+            self._client.retire_workers(idle)
+        self._left = 0
 
     @property
     def busy(self) -> bool:

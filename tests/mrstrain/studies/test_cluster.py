@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -145,19 +146,20 @@ def test_a_stage_whose_worker_is_killed_is_tried_once_more_when_it_is_alone(tmp_
 def test_a_worker_that_has_nothing_left_to_do_is_ended_and_the_other_goes_on(tmp_path):
     told = list[tuple[str, str, float]]()
     with cluster(lambda *event: told.append(event), [tmp_path], workers=2) as runner:
-        runner.keep(2)
-        assert len(runner._client.nthreads()) == 2
-        with FileLock(tmp_path / "held"):
+        with FileLock(tmp_path / "held") as held, ThreadPoolExecutor(1) as beside:
             runner.begin("last", "mesh", {}, tmp_path / "held")
+            ended = beside.submit(runner.next)
             wait_for(lambda: told)
+            time.sleep(2.5)
+            assert len(runner._client.nthreads()) == 2  # another stage may begin
             runner.keep(1)
             wait_for(lambda: len(runner._client.nthreads()) == 1)
-            wait_for(lambda: len(runner._nannies) == 1)
-        name, outcome, _ = runner.next()
+            time.sleep(2.5)
+            held.release()
+            name, outcome, _ = ended.result(timeout=300)
         assert name == "last"
         assert "missing" in outcome  # what it needs was not given, and it was not begun again
         assert told == [("last", "begun", 0.0)]
-        runner.keep(0)
         assert len(runner._client.nthreads()) == 1
 
 
