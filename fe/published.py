@@ -22,6 +22,7 @@ WHOLE = "all"
 """Name of the tissue in a set that has one constitutive model for all tissues."""
 
 _FAR, _ODD = 10.0, 1000.0  # times the range of the published sets: for their tissues, and for any other
+_UNITS = {1e-3: " Are its parameters in kPa, entered as MPa?", 1e3: " Are they in MPa, entered as kPa?"}
 _USED = 0.7, 1.4  # stretches of tissue under a plate
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
@@ -55,8 +56,8 @@ class MaterialSet:
         """The material of each region of a mesh, and sentences on what a person should know of that choice.
 
         That is each region that gets the material of another tissue; each tissue that is over ten times as stiff, or as
-        soft, as in any published set, because its parameters may be in another unit; and each material that is not
-        stable at stretches of 0.7 to 1.4, where its stress falls.
+        soft, as in any published set that names it, or outside their range and within it in another unit; and each
+        material that is not stable at stretches of 0.7 to 1.4, where its stress falls.
 
         Tendon and aponeurosis without a material get that of muscle, or else of fat; muscle gets that of fat. No other
         substitution is made.
@@ -75,7 +76,7 @@ class MaterialSet:
         by_region, notes = dict[str, Material](), list[str]()
         if WHOLE in self.materials:
             by_region = dict.fromkeys(regions, self.materials[WHOLE])
-            return by_region, tuple(doubts(self.name, by_region))
+            return by_region, tuple(doubts(self.name, self.materials))
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
@@ -117,25 +118,38 @@ def _falling(name: str, materials: Materials) -> list[str]:
 def _odd_stiffness(name: str, materials: Materials) -> list[str]:
     """A sentence for each tissue whose shear modulus no published set comes near, with the likely unit."""
     found = []
+    lumped = {one.materials[WHOLE].shear_modulus_mpa for one in _published().values() if WHOLE in one.materials}
+    alike = len({law.shear_modulus_mpa for law in materials.values()}) == 1 < len(materials)
     for tissue, law in materials.items():
-        own, tried = law.shear_modulus_mpa, (tissue.casefold(), *_INSTEAD.get(tissue.casefold(), ()))
-        of_sets = [
-            [of[t] for t in (*tried, WHOLE) if t in of] for of in (one.materials for one in _published().values())
-        ]
-        known = [laws[0].shear_modulus_mpa for laws in of_sets if laws]
-        low, high = min(known), max(known)
-        is_named = any(tissue.casefold() in one.materials for one in _published().values())
+        own, (low, high, is_named) = law.shear_modulus_mpa, _published_mpa(WHOLE if alike else tissue.casefold())
         times = _FAR if is_named else _ODD
-        if low / times <= own and (own <= high * times or not is_named):  # tissues of no set may be as stiff as bone
+        # tissues of no set may be as stiff as bone
+        is_near = low / times <= own and (own <= high * times or not is_named)
+        inside = [0.999 * low <= own * to <= 1.001 * high for to in (1.0, *_UNITS)]
+        is_in_other_unit = is_named and not inside[0] and any(inside)
+        if (is_near and not is_in_other_unit) or own in lumped:
             continue
-        far = f"over {times:g} times as {'stiff' if own > high else 'soft'} as in any published set"
-        units = {1e-3: " Are its parameters in kPa, entered as MPa?", 1e3: " Are they in MPa, entered as kPa?"}
-        unit = next((asks for times, asks in units.items() if low / _FAR <= own * times <= high * _FAR), "")
+        stiff = own > high
+        far = f"over {times:g} times as {'stiff' if stiff else 'soft'} as"
+        far = far if not is_near else "stiffer than" if stiff else "softer than"
+        unit = next((asks for to, asks in _UNITS.items() if low / _FAR <= own * to <= high * _FAR), "")
         found.append(
-            f"{name}: {tissue} has a shear modulus of {1e3 * own:.3g} kPa, which is {far} ({1e3 * low:.3g} to "
-            f"{1e3 * high:.3g} kPa).{unit}"
+            f"{name}: {tissue} has a shear modulus of {1e3 * own:.3g} kPa, which is {far} in any published set "
+            f"({1e3 * low:.3g} to {1e3 * high:.3g} kPa).{unit}"
         )
     return found
+
+
+def _published_mpa(tissue: str) -> tuple[float, float, bool]:
+    """Least and largest shear modulus of a tissue in the published sets, and whether one names it.
+
+    That of all tissues as one may be that of any; a tissue that no set names may be as any.
+    """
+    sets = [{t: law.shear_modulus_mpa for t, law in one.materials.items()} for one in _published().values()]
+    tried = (tissue, *_INSTEAD.get(tissue, ()))
+    known = [next(of[t] for t in tried if t in of) for of in sets if tissue != WHOLE and any(t in of for t in tried)]
+    known = known or [modulus for of in sets for modulus in of.values()]
+    return min(known), max(known), tissue == WHOLE or any(tissue in of for of in sets)
 
 
 def published_names() -> list[str]:

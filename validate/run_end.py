@@ -21,19 +21,22 @@ class EarlyEnd(NamedTuple):
 
 
 def early_end(place: Path) -> EarlyEnd | None:
-    """Why the run that wrote a result (.xplt, .frd) may have ended early; None where nothing says so.
+    """Why the run that wrote a result (.xplt or .vtk of FEBio, .frd) may have ended early; None where nothing says so.
 
-    FEBio says in its log how a run ended. Without a log, and for CalculiX, the time of the last state is compared with
-    the time of all steps in the deck. These files lie beside the result and have its name. Without a deck, CalculiX'
-    result must have its last line. ImageFileError for a damaged result.
+    FEBio says in its log how a run ended. The time of the last state is compared with the time of all steps in the
+    deck. These files lie beside the result and have its name. Without a deck, CalculiX' result must have its last line.
+    ImageFileError for a damaged result.
     """
     kind = place.suffix.lower()
-    if kind == ".xplt":
+    if kind in (".xplt", ".vtk"):
         log = _ends_of(place.with_suffix(".log"))
-        if "N O R M A L   T E R M I N A T I O N" in log:
-            return None
-        time, whole = time_in_xplt(place), _febio_time(place.with_suffix(".feb"))
+        time = time_in_xplt(place) if kind == ".xplt" else _time_in_vtk(place)
+        whole = _febio_time(place.with_suffix(".feb"))
         at = "" if time is None else f" at time {time:g}" + (f" of {whole:g}" if whole else "")
+        if "N O R M A L   T E R M I N A T I O N" in log:
+            if time is None or whole is None or time >= _NEARLY * whole:
+                return None
+            return EarlyEnd(f"reached its end, but the last state of its result is{at} ({place.name})", certain=True)
         if "E R R O R   T E R M I N A T I O N" in log:
             return EarlyEnd(f"ended with ERROR TERMINATION{at} ({place.stem}.log)", certain=True)
         if _BANNER in log:
@@ -57,6 +60,18 @@ def _compared(time: float | None, whole: float | None, deck: str) -> EarlyEnd | 
     if abs(time - round(time)) > 1.0 - _NEARLY:
         return EarlyEnd(f"ended at time {time:g}, which may be before the end of its load", certain=False)
     return None
+
+
+def _time_in_vtk(place: Path) -> float | None:
+    """The time that FEBio writes as the title of a state in VTK's format; None where the title is another."""
+    try:
+        with place.open("rb") as file:
+            title = re.fullmatch(
+                rb"# vtk DataFile[^\n]*\ntime ([-+.0-9eE]+)\s*\n", file.readline(256) + file.readline(256)
+            )
+            return None if title is None else float(title[1])
+    except (OSError, ValueError):
+        return None
 
 
 def _text(file: Path) -> str:

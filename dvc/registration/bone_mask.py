@@ -4,6 +4,7 @@ A mask that was written in another frame (RAS read as LPS) or with a flipped axi
 alignment then follows soft tissue, and a strain that looks sound is measured relative to it.
 """
 
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -19,6 +20,8 @@ _ENDS = 2  # voxels along the image's ends are left out: no gradient is known th
 _EDGE = 0.75  # of the largest voxel edge: voxels nearer than that to the surface are its edge
 _NEAR_MM = 2.5, 6.0  # distances of the voxels that it is compared with
 _BETTER = 1.2  # on heels, mirror images have at most 0.87 times the sharpness of a right mask
+_MORE = 1.02
+_TO_THE_OTHER = np.array([-1.0, -1.0, 1.0])
 _AXES = ("first", "second", "third")
 
 
@@ -26,31 +29,48 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
     """Why the mask may be mirrored, in a sentence; empty where it lies better on the image than its mirror images.
 
     The mask is on the image's grid. Its sharpness is the median of the image's gradient at the mask's surface, over
-    that 2.5 to 6 mm inside and outside of it; mirror images are those along the voxel axes, about the image's middle.
+    that 2.5 to 6 mm inside and outside of it. Mirror images are those along the voxel axes, about the image's middle,
+    and that with the signs of L and P reversed, as of a mask in RAS that was read as LPS.
     """
     gradient = _gradient(image)
     i, j, k = (slice(_ENDS, n - _ENDS) for n in image.grid.shape)
     gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
     if not bone.inside.any() or bone.inside.all():
         return ""
-    edges = bone.grid.spacing_mm
-    box = bone.box(int(np.ceil(_NEAR_MM[1] / edges.min())) + 1)
-    inside = bone.inside[box]
-    depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
-    at, near = depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
     # A mask on the mirrored image is as sharp as the mirrored mask on the image.
-    flips = {flip: tuple(slice(None, None, way) for way in flip) for flip in product((1, -1), repeat=3)}
-    found = {flip: _sharpness(gradient[mirrored][box], at, near) for flip, mirrored in flips.items()}
-    own = found.pop((1, 1, 1))
-    best = max(found, key=lambda flip: found[flip])
+    flips = [tuple(slice(None, None, way) for way in flip) for flip in product((1, -1), repeat=3)]
+    own, *of_flips = _sharpness(bone, [gradient[flip] for flip in flips])
+    found = dict(zip(map(_named, flips[1:]), of_flips, strict=True))
+    if (other := _in_the_other_frame(bone)).inside.any():
+        (sharpness,) = _sharpness(other, [gradient])
+        if sharpness > _MORE * max(of_flips):  # else it is one of them, up to voxels that are shifted
+            found["with the signs of L and P reversed"] = sharpness
+    best = max(found, key=lambda how: found[how])
     if not found[best] > _BETTER * own:
         return ""
-    axes = " and ".join(name for name, way in zip(_AXES, best, strict=True) if way < 0)
     return (
-        f"The bone mask may be mirrored or in another frame (RAS for LPS): mirrored along the {axes} voxel axis, its "
-        f"surface would follow the edges of the unloaded image better (sharpness {found[best]:.2f} instead of "
-        f"{own:.2f}). Check it on the unloaded image."
+        f"The bone mask may be mirrored or in another frame (RAS for LPS): {best}, its surface would follow the edges "
+        f"of the unloaded image better (sharpness {found[best]:.2f} instead of {own:.2f}). Check it on the unloaded "
+        "image."
     )
+
+
+def _named(flip: tuple[slice, ...]) -> str:
+    axes = " and ".join(name for name, way in zip(_AXES, flip, strict=True) if way.step < 0)
+    return f"mirrored along the {axes} voxel axis"
+
+
+def _in_the_other_frame(bone: Mask) -> Mask:
+    """The mask with the signs of L and P reversed, as far as it lies on its grid."""
+    grid, inside = bone.grid, np.zeros(bone.grid.shape, dtype=bool)
+    there = np.rint(grid.indices_of(bone.points() * _TO_THE_OTHER)).astype(np.int64)
+    low, high = np.maximum(there.min(axis=0), 0), np.minimum(there.max(axis=0) + 1, grid.shape)
+    if (high > low).all():
+        i, j, k = (slice(*ends) for ends in zip(low.tolist(), high.tolist(), strict=True))
+        points = grid.part((i, j, k)).points() * _TO_THE_OTHER
+        at = np.clip(np.rint(grid.indices_of(points)).astype(np.int64), 0, np.array(grid.shape) - 1)
+        inside[i, j, k] = bone.inside[tuple(np.moveaxis(at, -1, 0))] & grid.contains(points)
+    return Mask(grid, inside)
 
 
 def _gradient(image: Image) -> Float32Array:
@@ -63,7 +83,17 @@ def _gradient(image: Image) -> Float32Array:
     return np.sqrt(squared)
 
 
-def _sharpness(gradient: Float32Array, at: BoolArray, near: BoolArray) -> float:
+def _sharpness(bone: Mask, gradients: Sequence[Float32Array]) -> list[float]:
+    """Sharpness of a mask on images of such gradients, on its grid."""
+    edges = bone.grid.spacing_mm
+    box = bone.box(int(np.ceil(_NEAR_MM[1] / edges.min())) + 1)
+    inside = bone.inside[box]
+    depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
+    at, near = depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
+    return [_contrast(gradient[box], at, near) for gradient in gradients]
+
+
+def _contrast(gradient: Float32Array, at: BoolArray, near: BoolArray) -> float:
     """Median of a gradient at a surface over that near it; 0 where no voxel is at or near it."""
     if not (at.any() and near.any()):
         return 0.0

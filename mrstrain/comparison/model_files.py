@@ -151,7 +151,7 @@ def model_files(
             elif (end := early_end(chosen[load])) and end.certain and not usual.unfinished:
                 notes.append(
                     f"{name}: the run of {load} {end.reason}; this load is not compared. To compare it all the same, "
-                    "use unfinished (--unfinished)."
+                    "use unfinished (--unfinished, or unfinished = true under [models] in a study file)."
                 )
             else:
                 files[load].append(ModelFile(name, chosen[load], *reading))

@@ -332,7 +332,9 @@ class _Look:
     def at_results(self, labels: LabelMap) -> None:
         """Read every result of another code."""
         study = self.study
-        files, _ = model_files(list(study.loads), [study.path(p) for p in study.models.results], ModelReading())
+        reading = ModelReading(unfinished=study.models.unfinished)
+        files, notes = model_files(list(study.loads), [study.path(p) for p in study.models.results], reading)
+        self.notes += notes
         for of in files.values():
             for file in of:
                 self.tried(file.read, labels.grid)

@@ -152,6 +152,8 @@ class Models(modelling.SimulationOptions):
     """Material sets to simulate: published names, or your own files (.toml)."""
     results: Names = ()
     """Folders with results of other codes, with a file for each load, as in `compare`."""
+    unfinished: Flag = False
+    """Also compare results of FEBio and CalculiX whose run ended early."""
     drive: Flag = False
     """Also simulate the sets with measured boundary conditions (`drive`)."""
     level: Flag = False

@@ -304,6 +304,7 @@ def _comparison(
     given = [study.path(place) for place in study.uncertainty.variants]
     arguments |= {"variants_elsewhere": given} if given else {}
     arguments |= {"quick": True} if study.uncertainty.quick else {}
+    arguments |= {"unfinished": True} if study.models.unfinished else {}
     named = [file for place in elsewhere if place.exists() for file in files_named(place)]
     files = study.given([labels, names, *how.paths, *elsewhere, *named, *given])
     some = {"loads": measured} | ({"models": models} if models else {})

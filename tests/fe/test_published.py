@@ -44,6 +44,16 @@ def test_a_stiffness_in_another_unit_is_told() -> None:
     for name in published_names():
         assert not [note for note in material_set(name).for_regions(["fat", "muscle", "skin"])[1] if "modulus" in note]
 
+    for name in published_names():  # each published modulus of a tissue, typed in the other unit
+        for tissue, law in material_set(name).materials.items():
+            for times, unit in ((1e3, "in kPa, entered as MPa?"), (1e-3, "in MPa, entered as kPa?")):
+                if tissue != "all":
+                    typed = MaterialSet("mine", "", "", {tissue: NeoHooke.of(times * law.shear_modulus_mpa)})
+                    (note,) = typed.for_regions([tissue])[1]
+                    assert note.endswith(unit), note
+    for modulus_mpa in (0.002, 2.0):  # of one law for all tissues
+        assert MaterialSet("mine", "", "", {"all": NeoHooke.of(modulus_mpa)}).for_regions(["fat", "skin"])[1] == ()
+
     (note,) = MaterialSet("mine", "", "", {"foam": NeoHooke.of(1e-8)}).for_regions(["foam"])[1]
     assert note.startswith("mine: foam has a shear modulus of 1e-05 kPa, which is over 1000 times as soft")
 

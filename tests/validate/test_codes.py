@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import struct
 import tracemalloc
 import zipfile
@@ -24,7 +26,7 @@ from validate.run_end import _ends_of, early_end
 
 CODES = Path(__file__).with_name("codes.zip")
 with zipfile.ZipFile(CODES) as packed:
-    RESULTS = sorted(name for name in packed.namelist() if name.endswith((".xplt", ".frd")))
+    RESULTS = sorted(name for name in packed.namelist() if name.endswith((".xplt", ".frd", ".vtk")))
 
 REFUSED = {
     "febio/cut.xplt": "the last section is incomplete",
@@ -34,6 +36,7 @@ REFUSED = {
     "febio/text.xplt": "not a FEBio plot file",
     "febio/must.xplt": "FEBio wrote no loaded state",
     "febio/nodisp.xplt": '<var type="displacement"/>',
+    "febio/vtk.0.vtk": "the displacement is 0 everywhere",
     "calculix/binary.frd": r"\*NODE FILE",
     "calculix/far.frd": "100 m across",
     "calculix/modes.frd": "the displacement is 0 everywhere",
@@ -44,6 +47,7 @@ EARLY = {
     "febio/fails.xplt": "ended with ERROR TERMINATION at time 0.3 of 1 (fails.log)",
     "calculix/fails.frd": "ended at time 0.7 of 1 (fails.inp)",
     "calculix/incs.frd": "ended at time 0.4 of 1 (incs.inp)",
+    **{f"febio/vtk.{n}.vtk": f"ended at time 0.{2 * n}, which may be before the end of its load" for n in (1, 2, 3, 4)},
 }
 # Elements of which the file has more nodes than are taken, or shells and beams that CalculiX has expanded to solids,
 # whose nodes are new: the others are compared.
@@ -60,7 +64,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def printed(result: Path) -> dict[int, list[float]]:
     """Displacement (mm) by the number of the node, as the code itself printed it for the last state."""
-    if result.suffix == ".xplt":
+    if result.suffix == ".vtk":
+        name, state, _ = result.name.split(".")
+        last = result.with_name(f"{name}_U.txt").read_text().split("*Step")[1 + int(state)]
+    elif result.suffix == ".xplt":
         last = result.with_name(f"{result.stem}_U.txt").read_text().split("*Step")[-1]
     else:
         text = result.with_suffix(".dat").read_text()
@@ -73,7 +80,7 @@ def printed(result: Path) -> dict[int, list[float]]:
 def test_displacements_are_those_that_the_code_printed(folder: Path, name: str) -> None:
     found, truth = read_mesh(folder / name), printed(folder / name)
     u = np.asarray(found.at_nodes["displacement"])
-    numbers = np.arange(len(u)) + 1 if name.endswith(".xplt") else found.node_ids  # FEBio prints nodes in their order
+    numbers = found.node_ids if name.endswith(".frd") else np.arange(len(u)) + 1  # FEBio prints nodes in their order
     at = [(place, int(number)) for place, number in enumerate(numbers) if int(number) in truth]
     known = [(place, number) for place, number in at if np.isfinite(u[place]).all()]
     assert len(known) == len(found.node_ids) or name in FEWER
@@ -133,6 +140,44 @@ def test_what_is_no_result_is_refused_with_its_cause(folder: Path, name: str) ->
 def test_runs_that_ended_early_are_known_by_log_or_deck(folder: Path, name: str) -> None:
     end = early_end(folder / name)
     assert (end.reason if end else None) == EARLY.get(name)
+
+
+@pytest.mark.parametrize(("name", "says"), [("fails", "ended with ERROR TERMINATION at time {}"), ("hex8", None)])
+def test_a_state_in_vtk_is_that_of_the_run_in_the_log_beside_it(
+    folder: Path, tmp_path: Path, name: str, says: str | None
+) -> None:
+    shutil.copy(folder / f"febio/{name}.log", tmp_path / "Load1.log")
+    for state, time in ((2, 0.4), (5, 1.0)):
+        shutil.copy(folder / f"febio/vtk.{state}.vtk", tmp_path / "Load1.vtk")
+        end = early_end(tmp_path / "Load1.vtk")
+        assert (end is None) == (says is None)
+        assert end is None or end.reason.startswith(says.format(f"{time:g}"))
+    shutil.copy(folder / "febio/hex8.feb", tmp_path / "Load1.feb")
+    shutil.copy(folder / "febio/vtk.2.vtk", tmp_path / "Load1.vtk")
+    end = early_end(tmp_path / "Load1.vtk")
+    assert end is not None
+    assert "at time 0.4 of 1" in end.reason
+
+
+def test_a_plot_that_stops_before_the_normal_end_of_its_run_is_told(folder: Path, tmp_path: Path) -> None:
+    """As one that is copied while the run goes on, with the log of later."""
+    for ending in (".log", ".feb"):
+        shutil.copy(folder / f"febio/hex8{ending}", tmp_path / f"Load1{ending}")
+    whole = (folder / "febio/hex8.xplt").read_bytes()
+    at, starts = 4, list[int]()
+    while at < len(whole):
+        head = struct.unpack_from("<II", whole, at)
+        starts += [at] if head[0] == 0x02000000 else []  # a state
+        at += 8 + head[1]
+    (tmp_path / "Load1.xplt").write_bytes(whole)
+    assert early_end(tmp_path / "Load1.xplt") is None
+    (tmp_path / "Load1.xplt").write_bytes(whole[: starts[3]])
+    end = early_end(tmp_path / "Load1.xplt")
+    assert end is not None
+    assert end.certain
+    assert re.match(
+        r"reached its end, but the last state of its result is at time 0\.\d+ of 1 \(Load1\.xplt\)", end.reason
+    )
 
 
 def test_a_rigid_part_is_no_tissue(folder: Path) -> None:

@@ -18,6 +18,7 @@ from dvc.io.images.text_headers import read_meta_header, read_nrrd_header
 _log = logging.getLogger("dvc.images")
 
 _SMALLEST_MM, _LARGEST_MM = 1.0, 3000.0  # along the longest edge of an image
+_MOST_UNLIKE = 100.0  # longest over shortest edge of a voxel
 _MIN_SLICES = 4
 
 _FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool], StoredVolume]]] = {
@@ -92,7 +93,9 @@ def read_voxels(
     if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):
         if volume is not None:
             raise InputError(f"{place}: volume={volume} is for 4D files; for DICOM use series.")
-        return read_dicom(place, series=series, max_bytes=max_bytes)
+        grid, voxels = read_dicom(place, series=series, max_bytes=max_bytes)
+        _refuse_size_of_no_body(place, grid, "mm")
+        return grid, voxels
     if series is not None:
         raise InputError(f"{place}: series='{series}' is only for DICOM files and folders; this is neither.")
     stored = read_header(place, volume=volume, max_bytes=max_bytes)
@@ -103,7 +106,14 @@ def read_voxels(
 
 
 def _refuse_size_of_no_body(place: Path, grid: Grid, unit: str) -> None:
-    longest = float((grid.spacing_mm * grid.shape).max())
+    edges = grid.spacing_mm
+    if edges.max() > _MOST_UNLIKE * edges.min():
+        raise ImageFileError(
+            f"{place}: by its header, the voxels are {' x '.join(f'{edge:.3g}' for edge in edges)} mm, with edges that "
+            f"differ by a factor of {edges.max() / edges.min():.0f}. Some of them are probably in another unit, such "
+            "as metres. Correct the header."
+        )
+    longest = float((edges * grid.shape).max())
     if not _SMALLEST_MM <= longest <= _LARGEST_MM:
         size = f"{longest / 1000.0:.3g} m" if longest > _LARGEST_MM else f"{longest:.2g} mm"
         likely = "mm" if unit != "mm" else "micrometres" if longest > _LARGEST_MM else "metres"

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from dvc import fit_mask
 from dvc.images.image import Image, Mask
 from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
@@ -14,7 +17,7 @@ from dvc.measurement.subject import Subject
 from dvc.registration.bone_mask import mirrored_doubt
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Settings, register
-from phantoms import Heel, heel_grid, labels_of, scan
+from phantoms import Heel, heel_grid, heel_pair, labels_of, scan
 
 
 def flipped(mask: Mask, *axes: int) -> Mask:
@@ -66,6 +69,25 @@ def test_a_mask_is_judged_alike_at_any_voxels(heel_at, axes, moved_mm, told):
     mask = Mask(bone.grid, np.roll(flipped(bone, *axes).inside, steps, (0, 1, 2)))
     doubt = mirrored_doubt(image, mask)
     assert (f"mirrored along the {told} voxel axis" in doubt) if told else (doubt == "")
+
+
+@pytest.mark.parametrize("shift_mm", [(3.0, 2.0, 1.0), (12.0, 8.0, 10.0)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_mask_in_the_other_frame_is_told_wherever_the_image_lies(shift_mm, turned):
+    """RAS read as LPS turns a mask about the scanner's origin, which is in the middle of hardly any image."""
+    pair = heel_pair(3, load=0.6, shape=(64, 72, 68), spacing_mm=1.6)
+    grid = pair.reference.grid
+    grid = replace(grid, origin_mm=grid.origin_mm - grid.centre_mm + np.array(shift_mm))
+    if turned:
+        grid = grid.moved_by(Rotation.from_euler("xyz", [4.0, -3.0, 6.0], degrees=True).as_matrix(), np.zeros(3))
+    image, right = Image(grid, pair.reference.values), Mask(grid, pair.bone.inside)
+    signs = np.diag([-1.0, -1.0, 1.0])
+    box = right.box(2)  # a mask on the image's own grid is refused
+    own = grid.part(box)
+    own = replace(own, origin_mm=signs @ own.origin_mm, direction=signs @ own.direction)
+    wrong = fit_mask(Mask(own, right.inside[box]), grid, "bone mask")
+    assert "with the signs of L and P reversed, its surface" in mirrored_doubt(image, wrong)
+    assert mirrored_doubt(image, right) == ""
 
 
 def test_noise_and_a_mask_at_the_ends_of_the_image_raise_no_doubt(tiny_pair):

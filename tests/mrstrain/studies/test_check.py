@@ -22,6 +22,7 @@ from mrstrain.studies.file import read_study
 from mrstrain.studies.plan import plan
 from mrstrain.studies.run import forecast, run
 from tests.fe.test_simulate import dome
+from tests.mrstrain.comparison.test_model_files import model
 
 GRID = Grid((16, 16, 16), (2.0, 2.0, 2.0), (-6.0, -6.0, -6.0))  # around the dome
 STUDY = """
@@ -350,3 +351,15 @@ def test_gaps_are_left_out_where_the_study_says_so(study):
     with pytest.raises(InputError, match="level = true"):
         forecast(study)
     assert forecast(study, only=("register",))["register Load1"] == "run"
+
+
+def test_a_run_of_another_code_that_ended_early_is_told_and_may_be_asked_for(study):
+    model(study / "febio", Load1="febio/fails")
+    given = ("sets =", 'results = ["febio"]\nsets =')
+    assert "the run of Load1 ended with ERROR TERMINATION" in wrong(study, given)
+    (study / "study.toml").write_text(STUDY.replace(given[0], f"unfinished = true\n{given[1]}"))
+    told = read_study(study)
+    (compare,) = (stage for stage in plan(told) if stage.kind == "compare")
+    assert compare.arguments["unfinished"] is True
+    notes = check(study).notes
+    assert any("febio: the run of Load1 ended with ERROR TERMINATION" in note for note in notes), notes

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import nibabel
 import numpy as np
+import pydicom
 import pytest
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid
 from dvc.io.images.read import read_image
+from tests.dicomfiles import write_classic
 
 _SHAPE = (6, 7, 9)
 _SPACING = (1.5, 1.0, 2.5)
@@ -268,12 +270,17 @@ def test_a_real_4d_file_is_refused_with_its_number_of_volumes(real_data: Path) -
 
 
 @pytest.mark.parametrize(
-    ("edge", "says"), [(0.8, None), (0.0008, r"0\.0\d+ mm across.*in metres"), (800.0, r"\d m across.*in micrometres")]
-)
+    ("edge", "says"),
+    [
+        (0.8, None), ((0.3, 0.3, 10.0), None),
+        (0.0008, r"0\.0\d+ mm across.*in metres"), (800.0, r"\d m across.*in micrometres"),
+        ((0.0016, 0.0016, 1.6), r"voxels are 0\.0016 x 0\.0016 x 1\.6 mm.* factor of 1000\..* unit, such as metres"),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("ending", [".nii.gz", ".nrrd", ".mha"])
 def test_a_size_that_no_body_part_has_is_refused_with_its_likely_unit(tmp_path, edge, says, ending):
     sitk_image = sitk.GetImageFromArray(np.random.default_rng(1).normal(50.0, 1.0, (20, 21, 22)).astype(np.float32))
-    sitk_image.SetSpacing([edge] * 3)
+    sitk_image.SetSpacing(np.broadcast_to(edge, 3).tolist())
     path = tmp_path / f"image{ending}"
     sitk.WriteImage(sitk_image, str(path))
     if says is None:
@@ -282,3 +289,15 @@ def test_a_size_that_no_body_part_has_is_refused_with_its_likely_unit(tmp_path, 
     with pytest.raises(ImageFileError, match=says) as refused:
         read_image(path)
     assert path.name in str(refused.value)
+
+
+def test_a_size_that_no_body_part_has_is_refused_in_dicom(tmp_path):
+    series = tmp_path / "series"
+    write_classic(series, [("1", "0")] * 8)
+    for path in series.iterdir():
+        one = pydicom.dcmread(path)
+        one.PixelSpacing = ["800", "800"]
+        one.ImagePositionPatient = [1000.0 * float(v) for v in one.ImagePositionPatient]
+        one.save_as(path)
+    with pytest.raises(ImageFileError, match=r"\d m across.*in micrometres"):
+        read_image(series)
