@@ -23,6 +23,7 @@ WHOLE = "all"
 
 _FAR, _ODD = 10.0, 1000.0  # times the range of the published sets: for their tissues, and for any other
 _UNITS = {1e-3: " Are its parameters in kPa, entered as MPa?", 1e3: " Are they in MPa, entered as kPa?"}
+_ALIKE = 0.8, 1.25  # times a published model of all tissues, which may be that of a tissue
 _USED = 0.7, 1.4  # stretches of tissue under a plate
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
@@ -119,7 +120,7 @@ def _odd_stiffness(name: str, materials: Materials) -> list[str]:
     """A sentence for each tissue whose shear modulus no published set comes near, with the likely unit."""
     found = []
     lumped = {one.materials[WHOLE].shear_modulus_mpa for one in _published().values() if WHOLE in one.materials}
-    alike = len({law.shear_modulus_mpa for law in materials.values()}) == 1 < len(materials)
+    alike = len({id(law) for law in materials.values()}) == 1 and {"fat", "skin"} <= {t.casefold() for t in materials}
     for tissue, law in materials.items():
         own, (low, high, is_named) = law.shear_modulus_mpa, _published_mpa(WHOLE if alike else tissue.casefold())
         times = _FAR if is_named else _ODD
@@ -127,11 +128,12 @@ def _odd_stiffness(name: str, materials: Materials) -> list[str]:
         is_near = low / times <= own and (own <= high * times or not is_named)
         inside = [0.999 * low <= own * to <= 1.001 * high for to in (1.0, *_UNITS)]
         is_in_other_unit = is_named and not inside[0] and any(inside)
-        if (is_near and not is_in_other_unit) or own in lumped:
+        if (is_near and not is_in_other_unit) or any(_ALIKE[0] * one <= own <= _ALIKE[1] * one for one in lumped):
             continue
         stiff = own > high
         far = f"over {times:g} times as {'stiff' if stiff else 'soft'} as"
-        far = far if not is_near else "stiffer than" if stiff else "softer than"
+        if is_near:
+            far = "stiffer than" if stiff else "softer than"
         unit = next((asks for to, asks in _UNITS.items() if low / _FAR <= own * to <= high * _FAR), "")
         found.append(
             f"{name}: {tissue} has a shear modulus of {1e3 * own:.3g} kPa, which is {far} in any published set "

@@ -230,6 +230,9 @@ class Comparison:
             pairs = {load: tuple((a, b) for a, b in of) for load, of in content["not_told_apart"].items()}
             verdicts = {load: _verdict(of) for load, of in content["verdict_by_load"].items()}
             *totals, nothing = (a for a in areas if a.load == ALL_LOADS)
+            of_nothing = {a.load for a in areas if (a.model, a.tissue) == (NOTHING, ALL)} - {ALL_LOADS}
+            if of_nothing != set(content["coverage_ml"]):
+                raise ValueError("its loads are not those of the table of areas")
             few = tuple(content.get("not_informative", ()))  # older records do not tell
             ranking = Ranking(tuple(totals), nothing, tuple(content["told_apart"]), pairs, few)
             coverage, verdict, notes = content["coverage_ml"], _verdict(content["verdict"]), tuple(content["notes"])

@@ -1,6 +1,7 @@
 """Whether the run that wrote a result reached its end, by its log or deck beside it, or by its time."""
 
 import re
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -29,19 +30,23 @@ def early_end(place: Path) -> EarlyEnd | None:
     """
     kind = place.suffix.lower()
     if kind in (".xplt", ".vtk"):
-        log = _ends_of(place.with_suffix(".log"))
+        run = place.with_name(re.sub(r"\.\d+$", "", place.stem) if kind == ".vtk" else place.stem)  # Load1.5.vtk
+        log, deck = Path(f"{run}.log"), Path(f"{run}.feb")
+        said = _ends_of(log)
         time = time_in_xplt(place) if kind == ".xplt" else _time_in_vtk(place)
-        whole = _febio_time(place.with_suffix(".feb"))
+        whole = _febio_time(deck)
         at = "" if time is None else f" at time {time:g}" + (f" of {whole:g}" if whole else "")
-        if "N O R M A L   T E R M I N A T I O N" in log:
-            if time is None or whole is None or time >= _NEARLY * whole:
+        if "N O R M A L   T E R M I N A T I O N" in said:
+            *_, last = (None, *map(float, re.findall(r"converged at time : ([-+.0-9eE]+)\s", said)))
+            if time is None or last is None or time >= _NEARLY * last:
                 return None
-            return EarlyEnd(f"reached its end, but the last state of its result is{at} ({place.name})", certain=True)
-        if "E R R O R   T E R M I N A T I O N" in log:
-            return EarlyEnd(f"ended with ERROR TERMINATION{at} ({place.stem}.log)", certain=True)
-        if _BANNER in log:
-            return EarlyEnd(f"has no end in its log ({place.stem}.log) and stopped{at}", certain=True)
-        return _compared(time, whole, f"{place.stem}.feb")
+            reason = f"reached its end at time {last:g} ({log.name}), but {place.name} stops at time {time:g}"
+            return EarlyEnd(reason, certain=True)
+        if "E R R O R   T E R M I N A T I O N" in said:
+            return EarlyEnd(f"ended with ERROR TERMINATION{at} ({log.name})", certain=True)
+        if _BANNER in said:
+            return EarlyEnd(f"has no end in its log ({log.name}) and stopped{at}", certain=True)
+        return _compared(time, whole, deck.name)
     if kind == ".frd":
         time, whole = time_in_frd(place), _calculix_time(place.with_suffix(".inp"))
         if whole is None and time is not None and not is_closed(place):
@@ -69,7 +74,7 @@ def _time_in_vtk(place: Path) -> float | None:
             title = re.fullmatch(
                 rb"# vtk DataFile[^\n]*\ntime ([-+.0-9eE]+)\s*\n", file.readline(256) + file.readline(256)
             )
-            return None if title is None else float(title[1])
+            return None if title is None or not isfinite(float(title[1])) else float(title[1])
     except (OSError, ValueError):
         return None
 

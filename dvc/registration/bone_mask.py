@@ -20,7 +20,8 @@ _ENDS = 2  # voxels along the image's ends are left out: no gradient is known th
 _EDGE = 0.75  # of the largest voxel edge: voxels nearer than that to the surface are its edge
 _NEAR_MM = 2.5, 6.0  # distances of the voxels that it is compared with
 _BETTER = 1.2  # on heels, mirror images have at most 0.87 times the sharpness of a right mask
-_MORE = 1.02
+_MORE = 1.02  # than each of the others, which it may be
+_LEAST, _MOSTLY = 500, 0.5  # voxels of the mask, and the fraction of them that lies on the image in the other frame
 _TO_THE_OTHER = np.array([-1.0, -1.0, 1.0])
 _AXES = ("first", "second", "third")
 
@@ -41,7 +42,8 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
     flips = [tuple(slice(None, None, way) for way in flip) for flip in product((1, -1), repeat=3)]
     own, *of_flips = _sharpness(bone, [gradient[flip] for flip in flips])
     found = dict(zip(map(_named, flips[1:]), of_flips, strict=True))
-    if (other := _in_the_other_frame(bone)).inside.any():
+    other, count = _in_the_other_frame(bone), np.count_nonzero(bone.inside)
+    if count >= _LEAST and np.count_nonzero(other.inside) >= _MOSTLY * count:
         (sharpness,) = _sharpness(other, [gradient])
         if sharpness > _MORE * max(of_flips):  # else it is one of them, up to voxels that are shifted
             found["with the signs of L and P reversed"] = sharpness

@@ -130,7 +130,8 @@ def _labels(made: Mapping[str, Any] | None) -> str:
     if not made:
         return ""
     how = "from the unloaded image by mrstrain: skin by a layer model of the brightness below the surface, bones by a"
-    doubt = f"{100.0 * made['uncertain']:.0f} % of its voxels had a probability below 90 %"
+    uncertain = made.get("uncertain", made.get("unsure", np.nan))  # the latter in older records
+    doubt = f"{100.0 * uncertain:.0f} % of its voxels had a probability below 90 %"
     return f" The label map was made {how} watershed, and fat and muscle by total variation (Chambolle 2005); {doubt}."
 
 

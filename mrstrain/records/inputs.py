@@ -72,7 +72,9 @@ def made_from_image(labels: Path) -> LabelsFromImage | None:
         record = read_json(labels.with_name(image_stem(labels.name) + ".json"))
         if record["command"] != "label" or record["labels_sha256"] != file_hash(labels):
             return None
-        return LabelsFromImage(float(record["uncertain"]), tuple(map(str, record["notes"])))
+        return LabelsFromImage(
+            float(record["uncertain" if "uncertain" in record else "unsure"]), tuple(map(str, record["notes"]))
+        )
     except (OSError, ValueError, LookupError, TypeError):
         return None
 

@@ -26,7 +26,7 @@ from mrstrain.studies import stages
 from mrstrain.studies.scheduler import at_address
 from mrstrain.studies.stages import StageResult
 
-_TELL_EVERY_S = 1.0
+_TELL_EVERY_S, _MOST_LOST = 1.0, 3
 _A_FAULT = "This is an error in mrstrain; please report it:\n"
 _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
@@ -42,6 +42,7 @@ _SETTINGS = {
     # Workers that were not heard of for minutes by the clock would be ended: on a machine that slept, on one that has
     # too much to do, and when the clock is set. A stage that hangs is noticed by what it tells.
     "distributed.scheduler.worker-ttl": None,
+    "distributed.deploy.lost-worker-timeout": "15 minutes",  # for its process to start anew: `_STARTS_S`
     "distributed.worker.memory.terminate": False,  # memory is used in those processes
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.spill": False,
@@ -70,6 +71,7 @@ class _Call:
     to_end_s: float  # expected, from its start to the end of the study
     gib: float  # of memory, expected; 0 if not known
     died: str = ""  # how a process of it died at the first attempt
+    lost: int = 0  # workers that died while it waited for them
 
     @property
     def may_be_silent_s(self) -> float:
@@ -129,11 +131,11 @@ class StageRunner:
                 future = self._finished.get(timeout=_LOOK_EVERY_S)
                 break
             except queue.Empty:
-                self._end_idle_workers()
                 # Dask tells the end of a stage in a thread of its own, which there may be no memory for.
                 if ended := [one for one in self._under_way if one.done()]:
                     future = ended[0]
                     break
+                self._end_idle_workers()
                 left = self._client.status == "running" and self._client.nthreads()
                 lost_since = None if left else lost_since or time.monotonic()
                 lost_s = 0.0 if lost_since is None else time.monotonic() - lost_since
@@ -148,7 +150,7 @@ class StageRunner:
         if call is None:  # abandoned before
             return self.next()
         name = call.name
-        self._silent_s.pop(name, None)
+        begun = self._silent_s.pop(name, None) is not None
         error = future.exception() if future.status == "error" else None
         death = None if error is None else _death(error)
         if future.status == "finished" or death:
@@ -157,9 +159,12 @@ class StageRunner:
                 lines = (f"{_TRIED} {call.died}",) if call.died else ()
                 again = isinstance(outcome, StageResult) and lines
                 return name, replace(outcome, lines=(*outcome.lines, *lines)) if again else outcome, seconds
+            if isinstance(error, KilledWorker) and not (begun or call.died) and call.lost < _MOST_LOST:
+                self._submit(replace(call, lost=call.lost + 1))  # Dask blames all that wait for a worker that dies
+                return self.next()
             if call.died:
                 needs = f"; by the estimate it needs {call.gib:.1f} GiB of memory" if call.gib else ""
-                return name, f"{outcome} It was tried twice{needs}.", seconds
+                return name, f"{outcome} It was tried once more, alone{needs}.", seconds
             self._died.append(replace(call, died=str(outcome)))
             return self.next()
         if error is None:
@@ -220,7 +225,8 @@ class StageRunner:
         begun = sum(call.name in self._silent_s for call in self._under_way.values())
         if self._local is None or not 0 < begun == self._left:
             return
-        if idle := [one for one, keys in self._client.processing().items() if not keys]:
+        places = self._client.processing()
+        if any(places.values()) and (idle := [one for one, keys in places.items() if not keys]):
             self._client.retire_workers(idle)
         self._left = 0
 
@@ -294,7 +300,7 @@ def _ignore_interrupts() -> None:
 
 def _kill_workers(local: LocalCluster) -> None:
     """End the processes of a cluster and what they have started; Dask would wait for stages that do not listen."""
-    for nanny in local.workers.values():
+    for nanny in [*local.workers.values()]:
         nanny.auto_restart = False
         _kill(_processes_of(nanny))
 

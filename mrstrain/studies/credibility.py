@@ -64,10 +64,10 @@ def _converged(record: Mapping[str, Any], labels: str) -> str:
             return ""
         largest: dict[str, float | None] = {}
         for row in record["rows"]:
-            figure, error = str(row["quantity"]), row["limit"]["error"]
-            known = largest.setdefault(figure, error)
+            quantity, error = str(row.get("quantity", row.get("figure"))), row["limit"]["error"]  # older records
+            known = largest.setdefault(quantity, error)
             larger = None not in (known, error) and abs(error) > abs(known or 0.0)
-            largest[figure] = error if error is None or larger else known
+            largest[quantity] = error if error is None or larger else known
         sizes = ", ".join(f"{size:.2f}" for size in record["sizes_mm"])
         errors = "; ".join(f"{f} {'no limit found' if e is None else f'{e:+.1%}'}" for f, e in largest.items())
         material = record["parameters"]["material"]

@@ -6,6 +6,8 @@ import pytest
 
 from dvc.errors import InputError
 from fe import Material, MaterialSet, NeoHooke, Ogden, Yeoh, material_set, published_names, read_material_sets
+from fe.published import doubts
+from fe.variation import with_stiffness
 
 # Initial shear modulus (kPa) and Poisson's ratio by hand from the printed numbers.
 PRINTED = {
@@ -51,6 +53,11 @@ def test_a_stiffness_in_another_unit_is_told() -> None:
                     typed = MaterialSet("mine", "", "", {tissue: NeoHooke.of(times * law.shear_modulus_mpa)})
                     (note,) = typed.for_regions([tissue])[1]
                     assert note.endswith(unit), note
+    notes = MaterialSet("mine", "", "", {"fat": NeoHooke.of(0.29)}).for_regions(["fat", "muscle"])[1]
+    assert notes[0] == "mine has no material for muscle; that of fat is used."
+    assert "fat has a shear modulus of 290 kPa" in notes[1]
+    akrami = dict.fromkeys(("fat", "skin"), material_set("akrami").materials["all"])
+    assert doubts("", akrami) == doubts("", with_stiffness(akrami, "fat", 0.1)) == []  # an input that is varied
     for modulus_mpa in (0.002, 2.0):  # of one law for all tissues
         assert MaterialSet("mine", "", "", {"all": NeoHooke.of(modulus_mpa)}).for_regions(["fat", "skin"])[1] == ()
 

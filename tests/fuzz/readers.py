@@ -6,6 +6,7 @@ import itertools
 import json
 import zipfile
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,12 +21,14 @@ import fe
 import validate
 from dvc.deformation.interface_spline import Interfaces, InterfaceSpline
 from dvc.io.images.labels import read_names
+from dvc.io.images.scan_parameters import read_scan_parameters
 from dvc.io.transforms.interface_spline import write_interface_spline
 from dvc.io.transforms.read import read_displacement
 from dvc.io.transforms.write import write_elastix_transform, write_itk_transform
 from dvc.registration.elastix import presets
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.landmarks import read_landmarks
+from dvc.trust.quality import NoiseFloor, read_noise_floor
 from fe.simulation_files import read_checkpoint, write_checkpoint
 from mrstrain.comparison.model_files import IN_IMAGE, model_files
 from mrstrain.options.modelling import ModelReading
@@ -43,6 +46,7 @@ from tests.fe.solving import solved
 from tests.fe.test_simulate import ALONG, DOWN, LAWS, dome
 from tests.fuzz.damage import Reader
 from tests.meshfiles import TAGS, block, written as write_mesh
+from tests.validate.test_comparison import case, cube, error_table, labels as cube_labels, result, sheared
 from validate.location import read_thresholds
 from validate.run_end import early_end
 
@@ -200,6 +204,27 @@ def _read_ledger(path: Path) -> None:
     Ledger(path.parents[1], path.parents[1]).finished(STAGE)
 
 
+def _write_scan_parameters(folder: Path) -> None:
+    told = {"Manufacturer": "Siemens", "MagneticFieldStrength": 3, "FlipAngle": 8.5, "RepetitionTime": 0.011,
+            "EchoTime": 0.00495, "ScanningSequence": "GR", "SequenceName": "fl3d1"}  # fmt: skip
+    (folder / "a.json").write_text(json.dumps(told))
+    write_enhanced(folder / "enhanced.dcm")
+
+
+def _read_scan_parameters(path: Path) -> None:
+    read_scan_parameters(path.with_suffix(".nii") if path.suffix == ".json" else path)
+
+
+def _write_comparison(folder: Path) -> None:
+    mesh = cube(3)
+    cases = [case("Load1", sheared(0.4), [result("half", mesh, sheared(0.2))], error_table(0.0, 0.01))]
+    validate.compare(cases, cube_labels()).write(folder)
+
+
+def _read_comparison(path: Path) -> None:
+    str(validate.Comparison.read(path.parent))
+
+
 READERS: Mapping[str, Reader] = {
     "nifti": _of_image(dvc.read_image, VALUES, "a.nii", "packed.nii.gz"),
     "nrrd": _of_image(dvc.read_image, VALUES, "a.nrrd", "packed.nrrd", "b.nhdr", damaged="*.n*"),
@@ -238,6 +263,14 @@ READERS: Mapping[str, Reader] = {
         _read_ledger,
     ),
     "measurement": Reader(_write_measurement, _read_measurement, "*.*"),
+    "scan-parameters": Reader(_write_scan_parameters, _read_scan_parameters),
+    "noise-floor": Reader(
+        lambda folder: (folder / "quality.json").write_text(
+            json.dumps({"noise_floor": asdict(NoiseFloor(*np.linspace(0.01, 0.05, 5).tolist()))})
+        ),
+        read_noise_floor,
+    ),
+    "comparison": Reader(_write_comparison, _read_comparison, "*.[cj]*"),
     "error-model": Reader(lambda folder: error_model_of("heel-mr").write(folder / "a.json"), read_error_model),
     "error-table": Reader(_write_error_table, partial(read_errors, outcomes=REGISTERED)),
     "simulation": Reader(

@@ -47,7 +47,10 @@ EARLY = {
     "febio/fails.xplt": "ended with ERROR TERMINATION at time 0.3 of 1 (fails.log)",
     "calculix/fails.frd": "ended at time 0.7 of 1 (fails.inp)",
     "calculix/incs.frd": "ended at time 0.4 of 1 (incs.inp)",
-    **{f"febio/vtk.{n}.vtk": f"ended at time 0.{2 * n}, which may be before the end of its load" for n in (1, 2, 3, 4)},
+    **{
+        f"febio/vtk.{n}.vtk": f"reached its end at time 1 (vtk.log), but vtk.{n}.vtk stops at time 0.{2 * n}"
+        for n in (1, 2, 3, 4)
+    },
 }
 # Elements of which the file has more nodes than are taken, or shells and beams that CalculiX has expanded to solids,
 # whose nodes are new: the others are compared.
@@ -148,15 +151,15 @@ def test_a_state_in_vtk_is_that_of_the_run_in_the_log_beside_it(
 ) -> None:
     shutil.copy(folder / f"febio/{name}.log", tmp_path / "Load1.log")
     for state, time in ((2, 0.4), (5, 1.0)):
-        shutil.copy(folder / f"febio/vtk.{state}.vtk", tmp_path / "Load1.vtk")
-        end = early_end(tmp_path / "Load1.vtk")
-        assert (end is None) == (says is None)
-        assert end is None or end.reason.startswith(says.format(f"{time:g}"))
-    shutil.copy(folder / "febio/hex8.feb", tmp_path / "Load1.feb")
-    shutil.copy(folder / "febio/vtk.2.vtk", tmp_path / "Load1.vtk")
-    end = early_end(tmp_path / "Load1.vtk")
-    assert end is not None
-    assert "at time 0.4 of 1" in end.reason
+        for own in ("Load1.vtk", f"Load1.{state}.vtk"):  # as a person, and as FEBio names it
+            shutil.copy(folder / f"febio/vtk.{state}.vtk", tmp_path / own)
+            end = early_end(tmp_path / own)
+            if says is None:
+                assert (end is None) == (time == 1.0)
+                assert end is None or end.reason.endswith(f"(Load1.log), but {own} stops at time 0.4")
+            else:
+                assert end is not None
+                assert end.reason == f"{says.format(f'{time:g}')} (Load1.log)"
 
 
 def test_a_plot_that_stops_before_the_normal_end_of_its_run_is_told(folder: Path, tmp_path: Path) -> None:
@@ -175,9 +178,12 @@ def test_a_plot_that_stops_before_the_normal_end_of_its_run_is_told(folder: Path
     end = early_end(tmp_path / "Load1.xplt")
     assert end is not None
     assert end.certain
-    assert re.match(
-        r"reached its end, but the last state of its result is at time 0\.\d+ of 1 \(Load1\.xplt\)", end.reason
-    )
+    assert re.match(r"reached its end at time 1 \(Load1\.log\), but Load1\.xplt stops at time 0\.\d+", end.reason)
+    (tmp_path / "Load1.xplt").write_bytes(whole)
+    deck = (folder / "febio/hex8.feb").read_text()
+    (tmp_path / "Load1.feb").write_text(deck.replace("<time_steps>5<", "<time_steps>50<"))  # for the next run
+    assert (tmp_path / "Load1.feb").read_text() != deck
+    assert early_end(tmp_path / "Load1.xplt") is None
 
 
 def test_a_rigid_part_is_no_tissue(folder: Path) -> None:

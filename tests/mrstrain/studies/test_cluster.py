@@ -140,7 +140,30 @@ def test_a_stage_whose_worker_is_killed_is_tried_once_more_when_it_is_alone(tmp_
             name, outcome, _ = ended.result(timeout=300)
     assert name == "killed"
     assert outcome.startswith("Its worker process died: the system ended it, most often for lack of memory")
-    assert outcome.endswith("It was tried twice; by the estimate it needs 1.5 GiB of memory.")
+    assert outcome.endswith("It was tried once more, alone; by the estimate it needs 1.5 GiB of memory.")
+
+
+def test_stages_that_waited_for_a_worker_that_is_killed_go_to_another(tmp_path):
+    """Dask blames them for its death too."""
+    told = list[tuple[str, str, float]]()
+    with cluster(lambda *event: told.append(event), [tmp_path], workers=2) as runner:
+        with FileLock(tmp_path / "held"):
+            for name in ("first", "second"):
+                runner.begin(name, "mesh", {}, tmp_path / "held")
+            wait_for(lambda: {name for name, *_ in told} == {"first", "second"})
+            for number in range(6):
+                runner.begin(f"waits {number}", "mesh", {}, tmp_path / f"lock {number}")
+            wait_for(lambda: all(len(keys) > 1 for keys in runner._client.processing().values()))
+            (its_worker,) = (
+                address for address, keys in runner._client.processing().items() if any("first" in key for key in keys)
+            )
+            os.kill(runner._client.run(os.getpid, workers=[its_worker])[its_worker], signal.SIGKILL)
+            with ThreadPoolExecutor(1) as beside:
+                ended = beside.submit(lambda: [runner.next()[0] for _ in range(6)])
+                assert sorted(ended.result(timeout=300)) == [f"waits {number}" for number in range(6)]
+            assert [name for name, what, _ in told if what == "once more"] == []
+        assert [runner.next()[0] for _ in range(2)] == ["second", "first"]
+    assert [name for name, what, _ in told if what == "once more"] == ["first"]
 
 
 def test_a_worker_that_has_nothing_left_to_do_is_ended_and_the_other_goes_on(tmp_path):

@@ -137,7 +137,7 @@ def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, 
     if ends == 1:
         log = (tmp_path / "study" / "results" / "study.log").read_text()
         assert re.search(
-            r"mesh: FAILED .* The memory ran out .* It was tried twice; by the estimate it needs 1\.5 GiB", log
+            r"mesh: FAILED .* The memory ran out .* It was tried once more, alone; by the estimate it needs 1\.5 GiB", log
         )
 
 
@@ -180,7 +180,7 @@ def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path
     assert machine.begun == ["big", "small", "other", "next", "big"]
     assert list(ended) == ["small", "other", "next", "big"]
     expected = (
-        "It died. It was tried twice; by the estimate it needs 2.3 GiB of memory."
+        "It died. It was tried once more, alone; by the estimate it needs 2.3 GiB of memory."
         if deaths == 2
         else "This was computed at the second attempt. It died."
     )
@@ -246,7 +246,7 @@ def test_a_worker_without_memory_for_a_stage_counts_as_a_process_that_died(tmp_p
     runner.begin("mesh", "mesh", {}, tmp_path / "lock")
     _, outcome, _ = runner.next()
     assert outcome.startswith("The memory ran out (can't start new thread). Free memory")
-    assert "tried twice" in outcome
+    assert "tried once more, alone" in outcome
 
 
 def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):

@@ -45,6 +45,9 @@ class Here:
     def next(self) -> tuple[str, StageResult | str, float]:
         return self._ended.pop(0)
 
+    def keep(self, left: int) -> None:
+        self.left = left
+
 
 def stages_in(folder: Path, number: int = 1) -> list[Stage]:
     """Two measurements, a mesh and two models on it, and their comparison."""
