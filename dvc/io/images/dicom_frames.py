@@ -261,6 +261,11 @@ def read_values(frames: Sequence[Frame]) -> Float32Array:
     for path, own in places.items():
         numbers = [(frames[k].number or 1) - 1 for k in own]
         for k, stored in zip(own, _stored(path, numbers, (kind.rows, kind.columns)), strict=True):
+            if stored.shape != values[k].shape:
+                raise ImageFileError(
+                    f"{path}: the file has {' x '.join(map(str, stored.shape))} values where its header describes "
+                    f"{kind.rows} x {kind.columns}; it is damaged. Copy or export it again."
+                )
             values[k] = stored
             values[k] *= np.float32(frames[k].slope)
             values[k] += np.float32(frames[k].intercept)

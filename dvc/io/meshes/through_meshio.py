@@ -57,6 +57,8 @@ def read_gmsh(path: Path) -> RawMesh:
         mesh = _read(path, lambda _: gmsh.read_buffer(file))
     if len(tags) != len(mesh.points):
         raise ImageFileError(f"{path}: {len(tags)} node numbers for {len(mesh.points)} nodes. Export the mesh again.")
+    if narrow := [c.type for c in mesh.cells if c.data.shape[1] < len(_TO_VTK.get(c.type, ()))]:
+        raise ImageFileError(f"{path}: cells of the kind {narrow[0]} have too few nodes. Export the mesh again.")
     blocks = [(c.type, c.data[:, _TO_VTK[c.type]] if c.type in _TO_VTK else c.data) for c in mesh.cells]
     sizes = [len(data) for _, data in blocks]
     groups: list[tuple[str, IntArray]] = []

@@ -191,3 +191,46 @@ def test_a_command_ends_and_keeps_what_is_finished(case, group, images, tmp_path
     assert not made.absent.exists()
     if case is measuring_accuracy:
         assert [run.case.motion for run in _finished(tmp_path / "out" / "runs").values()] == ["still"]
+
+
+NOTEBOOK = """
+import psutil
+import mrstrain
+
+try:
+    {call}
+except KeyboardInterrupt:
+    below = [" ".join(one.cmdline()) for one in psutil.Process().children(recursive=True)]
+    print("interrupted", [one for one in below if "resource_tracker" not in one])
+"""
+
+
+@pytest.mark.parametrize("function", ["run", "simulate"])
+def test_a_function_that_a_notebook_interrupts_raises_and_leaves_no_process(images, tmp_path, function):
+    """The kernel goes on: it gets KeyboardInterrupt, and nothing computes beside it."""
+    if function == "run":
+        shutil.copytree(images, tmp_path / "study")
+        call = f'mrstrain.run({str(tmp_path / "study")!r}, only=["register"], workers=1)'
+        records = tmp_path / "study" / "results" / ".study"
+        begun = partial(under_way, records, "register Load1")
+    else:
+        case = simulating(images, tmp_path)
+        loads = ", ".join(f'LoadStep("Load{n}", 2.0, {0.3 * n})' for n in range(9))
+        call = (
+            f"from fe import LoadStep; mrstrain.simulate({case.command[1]!r}, out={str(tmp_path / 'out')!r}, "
+            f'loads=[{loads}], sets=["luboz"], plate_normal=(-1, 0, 0), shear_direction=(0, 1, 0), workers=1)'
+        )
+        begun = partial(case.begun, psutil.Process())
+    kernel = subprocess.Popen(
+        [sys.executable, "-c", NOTEBOOK.format(call=call)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        wait_for(begun, kernel)
+        kernel.send_signal(signal.SIGINT)
+        told, _ = kernel.communicate(timeout=OVER_S)
+        assert told.splitlines()[-1] == "interrupted []", told
+        assert kernel.returncode == 0
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(kernel.pid, signal.SIGKILL)

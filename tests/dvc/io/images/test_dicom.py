@@ -255,6 +255,16 @@ def test_a_slice_cut_short_is_refused(tmp_path: Path, syntax: Any, kept: float) 
         read_image(folder)
 
 
+def test_a_slice_with_more_voxels_than_its_header_describes_is_refused(tmp_path: Path) -> None:
+    folder = _series(tmp_path / "s")
+    last = _write(folder, _SLICES - 1)
+    header = pydicom.dcmread(last)
+    header.PixelData = 4 * header.PixelData
+    header.save_as(last)
+    with pytest.raises(ImageFileError, match=rf"{last.name}: the file has 4 x 6 x 5 values .* describes 6 x 5; it is"):
+        read_image(folder)
+
+
 def test_other_files_in_the_folder_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     folder = _series(tmp_path / "s")

@@ -262,6 +262,7 @@ def test_an_ansys_archive_that_may_be_cut_after_a_block_is_told(
         ("msh-22", "$Elements\n50\n", "$Elements\n5\n", "50 of 5 Elements"),
         ("msh-22", f"\n{TAGS[0]} ", f"\n{TAGS[0]}000000000 ", f"to {TAGS[0]}000000000, and only 1 to 100000000 are"),
         ("msh-22", "$EndNodes", "$EndNode", "cannot be read as a mesh"),
+        ("msh-22", "\n15 4 2 1 ", "\n15 14 4 2 1 ", "cells of the kind pyramid14 have too few nodes"),
         ("msh-41", "$Nodes\n2 27 ", "$Nodes\n2 28 ", "blocks of Nodes do not add up"),
         ("msh-41", "$Elements\n3 50 ", "$Elements\n3 49 ", "blocks of Elements do not add up"),
         ("msh-41", "$Elements\n3 50 ", "$Elements\n999999999 50 ", "could not be read to its end"),
