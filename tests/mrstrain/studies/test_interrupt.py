@@ -194,14 +194,24 @@ def test_a_command_ends_and_keeps_what_is_finished(case, group, images, tmp_path
 
 
 NOTEBOOK = """
+import time
+from contextlib import suppress
 import psutil
 import mrstrain
+
+def alive():
+    for one in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):
+            if one.status() != psutil.STATUS_ZOMBIE and "resource_tracker" not in " ".join(one.cmdline()):
+                yield one.pid
 
 try:
     {call}
 except KeyboardInterrupt:
-    below = [" ".join(one.cmdline()) for one in psutil.Process().children(recursive=True)]
-    print("interrupted", [one for one in below if "resource_tracker" not in one])
+    ends = time.monotonic() + 10.0
+    while (left := [*alive()]) and time.monotonic() < ends:
+        time.sleep(0.1)
+    print("interrupted", left)
 """
 
 
