@@ -102,15 +102,16 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        from dvc.errors import MrstrainError
+        try:
+            from dvc.errors import MrstrainError
+            from mrstrain.records.outcome import lack_of_machine
 
-        if isinstance(error, MrstrainError):
-            _stop(str(error))
-        from mrstrain.records.outcome import lack_of_machine
-
-        if not (lack := lack_of_machine(error)):
+            message = str(error) if isinstance(error, MrstrainError) else lack_of_machine(error)
+        except (MemoryError, SystemError, ImportError):  # for want of memory to load these
+            message = "The memory ran out. Free memory or use fewer --workers."
+        if not message:
             raise
-        _stop(lack)
+        _stop(message)
     except SystemExit as ended:
         if ended.code in _TOLD_TO_END:  # threads that still compute would be waited for
             atexit._run_exitfuncs()
