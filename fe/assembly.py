@@ -334,8 +334,7 @@ def _elements(
     with_tangent: bool, forces: FloatArray, tangents: FloatArray, lowest: FloatArray,
 ) -> None:  # fmt: skip
     """Forces and tangents of cells, and the smallest det F at the quadrature points of each."""
-    nodes, points = tables.shape[1], tables.shape[0]
-    width = 3 * nodes + 4
+    points, nodes, width = tables.shape[0], tables.shape[1], 3 * tables.shape[1] + 4
     g, h = np.empty((nodes, 3)), np.empty((nodes, 3))
     F, U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     stress, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))

@@ -126,9 +126,7 @@ class _Validation:
     tissue: str
     remaining: FloatArray  # errors of the maximum shear strain (n,) minus their expected bias
     within: tuple[BoolArray, ...]  # whether the errors are within 1.96 standard deviations: of shear and of components
-    scores: (
-        FloatArray  # distance of the true statistics from the draws' middle, in units of their interval on that side
-    )
+    scores: FloatArray  # distance of the true statistics from the draws' middle, over the interval on that side
 
 
 def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:

@@ -24,9 +24,10 @@ class EarlyEnd(NamedTuple):
 def early_end(place: Path) -> EarlyEnd | None:
     """Why the run that wrote a result (.xplt or .vtk of FEBio, .frd) may have ended early; None where nothing says so.
 
-    FEBio says in its log how a run ended. The time of the last state is compared with the time of all steps in the
-    deck. These files lie beside the result and have its name. Without a deck, CalculiX' result must have its last line.
-    ImageFileError for a damaged result.
+    FEBio says in its log how a run ended, and at what time. Without a log, and for CalculiX, the time of the last state
+    is compared with the time of all steps in the deck. These files lie beside the result and have its name, for .vtk
+    without the number of the state. Without a deck, CalculiX' result must have its last line. ImageFileError for a
+    damaged result.
     """
     kind = place.suffix.lower()
     if kind in (".xplt", ".vtk"):
@@ -37,7 +38,7 @@ def early_end(place: Path) -> EarlyEnd | None:
         whole = _febio_time(deck)
         at = "" if time is None else f" at time {time:g}" + (f" of {whole:g}" if whole else "")
         if "N O R M A L   T E R M I N A T I O N" in said:
-            *_, last = (None, *map(float, re.findall(r"converged at time : ([-+.0-9eE]+)\s", said)))
+            *_, last = (None, *map(float, re.findall(r"converged at time : (\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s", said)))
             if time is None or last is None or time >= _NEARLY * last:
                 return None
             reason = f"reached its end at time {last:g} ({log.name}), but {place.name} stops at time {time:g}"

@@ -330,12 +330,11 @@ class Measurement:
         fixed = page.FIXED_WEIGHTS if weights and self.is_repeat else ""
         notes = " ".join(filter(None, [engine, "" if made is None else made.told, fixed, *self._of_error_bars]))
         tables = [replace(page.key_figures(self.quality, self.alignment), note=notes), page.region_table(self.regions)]
-        tables += [] if self.is_repeat else weights
-        tables += page.error_tables(bars)
-        shown = [pictures[stem] for stem in ("strain", "curves")]
-        shown += [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
+        tables += [*([] if self.is_repeat else weights), *page.error_tables(bars)]
+        others = [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
+        shown = pictures["strain"], pictures["curves"], *others
         short = page.summary_table(self.regions, self.intervals)
-        return Section(self.name, self.verdict, tuple(tables), tuple(shown), pictures_first=True, summary=short)
+        return Section(self.name, self.verdict, tuple(tables), shown, pictures_first=True, summary=short)
 
     def drawings(self) -> dict[str, Drawing]:
         """The figures of a report, by the name of their files; InputError for one that was read from a folder."""

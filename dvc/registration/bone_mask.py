@@ -20,7 +20,7 @@ _ENDS = 2  # voxels along the image's ends are left out: no gradient is known th
 _EDGE = 0.75  # of the largest voxel edge: voxels nearer than that to the surface are its edge
 _NEAR_MM = 2.5, 6.0  # distances of the voxels that it is compared with
 _BETTER = 1.2  # on heels, mirror images have at most 0.87 times the sharpness of a right mask
-_MORE = 1.02  # than each of the others, which it may be
+_MORE = 1.02  # times the sharpest of those about the image's middle, one of which it is where the origin lies there
 _LEAST, _MOSTLY = 500, 0.5  # voxels of the mask, and the fraction of them that lies on the image in the other frame
 _TO_THE_OTHER = np.array([-1.0, -1.0, 1.0])
 _AXES = ("first", "second", "third")
@@ -45,7 +45,7 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
     other, count = _in_the_other_frame(bone), np.count_nonzero(bone.inside)
     if count >= _LEAST and np.count_nonzero(other.inside) >= _MOSTLY * count:
         (sharpness,) = _sharpness(other, [gradient])
-        if sharpness > _MORE * max(of_flips):  # else it is one of them, up to voxels that are shifted
+        if sharpness > _MORE * max(of_flips):
             found["with the signs of L and P reversed"] = sharpness
     best = max(found, key=lambda how: found[how])
     if not found[best] > _BETTER * own:

@@ -182,13 +182,8 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
     columns = *_CONDITION, "motion", "tissue", "remaining error, mean", *(f"{name}, %" for name in shares)
 
     def cells(r: CoverageRow) -> tuple[Cell, ...]:
-        within = (
-            r.voxels_within,
-            r.normal_strain_within,
-            r.shear_strain_within,
-            r.displacement_within,
-            r.statistics_within,
-        )
+        strains = r.voxels_within, r.normal_strain_within, r.shear_strain_within
+        within = *strains, r.displacement_within, r.statistics_within
         return (*r.condition, r.motion, r.tissue, r.left_over, *(100 * share for share in within))
 
     note = (

@@ -16,6 +16,7 @@ from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_names
 from dvc.measurement.subject import LabelsFromImage
 from mrstrain.cli.app import app
+from mrstrain.comparison.methods import _labels
 from mrstrain.measurement.label import read_marks
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import made_from_image, read_subject
@@ -163,7 +164,14 @@ def test_another_subjects_labels_are_carried_over_and_counted_as_made(folder: Pa
     assert np.mean((made.labels != truth.labels)[truth.labels > 0]) < 0.15
     record = json.loads(out.with_name("tissues.json").read_text())
     assert set(record["inputs"]) == {"load0", "labels", "names", "from_image"}
-    assert made_from_image(out) == LabelsFromImage(record["uncertain"], tuple(record["notes"]))
+    known = LabelsFromImage(record["uncertain"], tuple(record["notes"]))
+    assert made_from_image(out) == known
+    beside = out.with_name("tissues.json")
+    older = json.loads(beside.read_text())
+    older["unsure"] = older.pop("uncertain")  # as an earlier version wrote it
+    beside.write_text(json.dumps(older))
+    assert made_from_image(out) == known
+    assert f"{100 * known.uncertain:.0f} % of its voxels had a probability below 90 %" in _labels(older)
     assert out.with_name("tissues_probability.nii.gz").is_file()
 
 
