@@ -64,6 +64,22 @@ class _Children(LokyContext):  # type: ignore[misc]
     Process = _Child
 
 
+_here: list[None] = []  # blocks of `in_this_process`
+
+
+@contextmanager
+def in_this_process() -> Iterator[None]:
+    """Let every `Worker` run its tasks in this process, which is a child itself: another would only need more memory.
+
+    A task can then neither be killed nor crash alone.
+    """
+    _here.append(None)
+    try:
+        yield
+    finally:
+        _here.pop()
+
+
 class Worker(AbstractContextManager["Worker", None]):
     """One child process that runs one task at a time; if it dies, that task fails and the next gets a fresh process.
 
@@ -94,6 +110,8 @@ class Worker(AbstractContextManager["Worker", None]):
 
         ``what`` is the task in words ("registering Load1"); ``watch`` is called about twice a second meanwhile.
         """
+        if _here:
+            return _run_here(what, task, *args, watch=watch)
         with self._lock:
             executor = self._running()
             future: Future[_T] | None = None
@@ -126,7 +144,7 @@ class Worker(AbstractContextManager["Worker", None]):
                     self._executor = None
                 if not is_lack_of_memory(failure):
                     raise
-                raise WorkerError(f"The memory ran out while {what} ({failure}). {TOO_LITTLE_MEMORY}") from failure
+                raise _lack_of_memory(what, failure) from failure
             finally:
                 if future is not None and not future.done():  # an interrupt: the task would be waited for
                     executor.shutdown(wait=False, kill_workers=True)
@@ -253,6 +271,21 @@ def _result(future: "Future[_T]", watch: Callable[[], None] = lambda: None) -> _
             if future.done():
                 raise  # the task itself timed out on something; not ours to hide
             watch()
+
+
+def _run_here(what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None) -> _T:
+    """The result of a task that runs on a thread of this process."""
+    try:
+        with ThreadPoolExecutor(1) as beside:
+            return _result(beside.submit(_then_hand_back, task, *args), watch or (lambda: None))
+    except Exception as failure:
+        if not is_lack_of_memory(failure):
+            raise
+        raise _lack_of_memory(what, failure) from failure
+
+
+def _lack_of_memory(what: str, failure: Exception) -> WorkerError:
+    return WorkerError(f"The memory ran out while {what} ({failure}). {TOO_LITTLE_MEMORY}")
 
 
 def _is_answered(executor: ProcessPoolExecutor) -> bool:

@@ -4,10 +4,9 @@ import logging
 import queue
 import signal
 import time
-import traceback
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,19 +14,17 @@ from typing import Any
 import dask
 import psutil
 from distributed import Client, Future, KilledWorker, LocalCluster, Nanny, get_worker
-from filelock import FileLock
 
-from dvc.errors import MrstrainError, WorkerError
-from dvc.memory import hand_memory_back, is_lack_of_memory
-from dvc.threads import on_one_core, usable_cores
+from dvc.errors import WorkerError
+from dvc.memory import is_lack_of_memory
+from dvc.threads import usable_cores
 from mrstrain.records.outcome import lack_of_machine
 from mrstrain.records.progress import NOTE, OnProgress, duration
-from mrstrain.studies import stages
 from mrstrain.studies.scheduler import at_address
+from mrstrain.studies.stage_process import Outcome, run_stage
 from mrstrain.studies.stages import StageResult
 
-_TELL_EVERY_S, _MOST_LOST = 1.0, 3
-_A_FAULT = "This is an error in mrstrain; please report it:\n"
+_MOST_LOST = 3
 _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _NOTHING_LOGGED = logging.CRITICAL + 1  # by Dask, as of each message that there is no memory for: stages tell of theirs
@@ -84,7 +81,7 @@ class StageRunner:
 
     def __init__(self, client: Client, watch: OnProgress, local: LocalCluster | None = None) -> None:
         self._client, self._watch = client, watch
-        self._local, self._left = local, 0  # workers for this run alone; stages left, if known
+        self._local = local  # workers for this run alone
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
@@ -135,7 +132,6 @@ class StageRunner:
                 if ended := [one for one in self._under_way if one.done()]:
                     future = ended[0]
                     break
-                self._end_idle_workers()
                 left = self._client.status == "running" and self._client.nthreads()
                 lost_since = None if left else lost_since or time.monotonic()
                 lost_s = 0.0 if lost_since is None else time.monotonic() - lost_since
@@ -216,19 +212,6 @@ class StageRunner:
     @property
     def _nannies(self) -> list[Nanny]:
         return [] if self._local is None else [*self._local.workers.values()]
-
-    def keep(self, left: int) -> None:
-        """Keep no more workers of this machine than stages are left, once these have begun: each holds 0.3 GiB."""
-        self._left = left
-
-    def _end_idle_workers(self) -> None:
-        begun = sum(call.name in self._silent_s for call in self._under_way.values())
-        if self._local is None or not 0 < begun == self._left:
-            return
-        places = self._client.processing()
-        if any(places.values()) and (idle := [one for one, keys in places.items() if not keys]):
-            self._client.retire_workers(idle)
-        self._left = 0
 
     @property
     def busy(self) -> bool:
@@ -323,30 +306,13 @@ def _kill(processes: Sequence[psutil.Process]) -> None:
                 process.kill()
 
 
-def _run(topic: str, call: _Call) -> tuple[StageResult | WorkerError | str, float]:
-    """Run a stage in a worker, under its lock; errors are returned, as text unless a process of it died."""
-    began, reported = time.monotonic(), -_TELL_EVERY_S
-    worker = get_worker()
+def _run(topic: str, call: _Call) -> tuple[Outcome, float]:
+    """Run a stage in a process below a worker."""
+    began, worker = time.monotonic(), get_worker()
 
     def tell(what: str, fraction: float) -> None:
-        nonlocal reported
-        now = time.monotonic()
-        if fraction >= 1.0 or now - reported >= _TELL_EVERY_S:
-            reported = now
-            worker.log_event(topic, (call.name, what, float(fraction)))
+        worker.log_event(topic, (call.name, what, fraction))
 
     tell("once more" if call.died else "begun", 0.0)
-    stage: Callable[..., StageResult] = getattr(stages, call.function)
-    outcome: StageResult | WorkerError | str
-    try:
-        with FileLock(call.lock), on_one_core() if call.died else nullcontext():
-            outcome = stage(tell, **call.arguments)
-    except WorkerError as death:
-        outcome = WorkerError(str(death))
-    except MrstrainError as error:
-        outcome = str(error)
-    except Exception as error:
-        lack = lack_of_machine(error)
-        outcome = WorkerError(lack) if is_lack_of_memory(error) else lack or _A_FAULT + traceback.format_exc()
-    hand_memory_back()
+    outcome = run_stage(call.name, call.function, call.arguments, call.lock, tell, alone=bool(call.died))
     return outcome, time.monotonic() - began

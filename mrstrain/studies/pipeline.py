@@ -238,7 +238,6 @@ def run_all(
         for prefix in pipelines:
             begin(prefix)
         while runners and runners[0].busy:
-            runners[0].keep(sum(len(one.stages) - len(one.outcomes) for one in pipelines.values()))
             name, result, seconds = runners[0].next()
             prefix = prefixes[name]
             pipelines[prefix].end(name.removeprefix(prefix), result, seconds, logs[prefix])

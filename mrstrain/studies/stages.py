@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 from dvc import Verdict
 from dvc.report.page import Section
-from dvc.worker import Worker
 from mrstrain.options.model import Options
 from mrstrain.records.progress import NOTE
 
@@ -137,16 +136,11 @@ def vary(
     return StageResult(tuple(done.summary()), complete=done.complete, headline=done.lines[0])
 
 
-def drive(tell: Tell, *, sets: Sequence[str], **options: Any) -> StageResult:
+def drive(tell: Tell, *, mesh: Path, dvc: Path, **options: Any) -> StageResult:
     """Simulate one material set with measured boundary conditions; as `mrstrain.drive`."""
-    with Worker(threads=1) as worker:
-        return worker.run(f"driving {sets[0]}", _driven, {"sets": sets, **options})
-
-
-def _driven(options: dict[str, Any]) -> StageResult:
     from mrstrain.comparison.drive import drive as run
 
-    done = run(options.pop("mesh"), options.pop("dvc"), threads=1, **options)
+    done = run(mesh, dvc, threads=1, progress=lambda _, *stage: tell(*stage), **options)
     return StageResult(tuple(done.summary()[:-1]), complete=done.complete)
 
 

@@ -6,8 +6,8 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -166,24 +166,16 @@ def test_stages_that_waited_for_a_worker_that_is_killed_go_to_another(tmp_path):
     assert [name for name, what, _ in told if what == "once more"] == ["first"]
 
 
-def test_a_worker_that_has_nothing_left_to_do_is_ended_and_the_other_goes_on(tmp_path):
-    told = list[tuple[str, str, float]]()
-    with cluster(lambda *event: told.append(event), [tmp_path], workers=2) as runner:
-        with FileLock(tmp_path / "held") as held, ThreadPoolExecutor(1) as beside:
-            runner.begin("last", "mesh", {}, tmp_path / "held")
-            ended = beside.submit(runner.next)
-            wait_for(lambda: told)
-            time.sleep(2.5)
-            assert len(runner._client.nthreads()) == 2  # another stage may begin
-            runner.keep(1)
-            wait_for(lambda: len(runner._client.nthreads()) == 1)
-            time.sleep(2.5)
-            held.release()
-            name, outcome, _ = ended.result(timeout=300)
-        assert name == "last"
-        assert "missing" in outcome  # what it needs was not given, and it was not begun again
-        assert told == [("last", "begun", 0.0)]
-        assert len(runner._client.nthreads()) == 1
+def test_a_stage_leaves_nothing_in_the_memory_of_its_worker(images, tmp_path):
+    """A worker that ran stages itself held 0.3 to 0.6 GiB of modules and freed arrays to the end of the study."""
+    with cluster(lambda *_: None, [tmp_path], workers=1) as runner:
+        runner.begin(
+            "mesh", "mesh", {"labels": images / "missing.nii.gz", "out": tmp_path / "m.vtu"}, tmp_path / "lock"
+        )
+        assert "missing.nii.gz" in runner.next()[1]
+        (loaded,) = runner._client.run(lambda: {*sys.modules}).values()
+    assert "mrstrain.studies.stages" in loaded
+    assert not loaded & {"fe", "numba", "scipy.ndimage", "SimpleITK", "matplotlib", "vtk", "mrstrain.models.mesh"}
 
 
 def test_freed_arrays_serve_the_next_in_a_worker(of_this_machine):

@@ -22,10 +22,11 @@ from dvc.errors import InputError, WorkerError
 from dvc.threads import usable_cores
 from mrstrain.records.progress import NOTE
 from mrstrain.studies import cluster, ledger, stages
-from mrstrain.studies.cluster import StageRunner, _Call, _run
+from mrstrain.studies.cluster import StageRunner, _Call
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
 from mrstrain.studies.run import _log
+from mrstrain.studies.stage_process import _run
 from mrstrain.studies.stages import StageResult
 from tests.mrstrain.studies import test_pipeline
 from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
@@ -77,14 +78,13 @@ def test_a_failure_of_the_machine_is_no_error_in_mrstrain(tmp_path, monkeypatch,
 
 
 def ended_by(failure: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch) -> object:
-    """What a worker returns of a stage that raises an error."""
+    """What the process of a stage returns that raises an error."""
 
     def failing(tell: object) -> None:
         raise failure
 
-    monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(log_event=lambda *_: None))
     monkeypatch.setattr(stages, "mesh", failing)
-    return _run("topic", _Call("mesh", "mesh", {}, str(folder / "lock"), 0.0, 0.0))[0]
+    return _run("mesh", {}, str(folder / "lock"), alone=False, news=folder / "news")
 
 
 @pytest.mark.parametrize(
@@ -104,14 +104,13 @@ def test_memory_that_runs_out_counts_as_a_process_that_died(tmp_path, monkeypatc
     assert "fewer --workers" in str(ended)
 
 
-@pytest.mark.parametrize("died", ["", "It died."])
-def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, died):
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, alone):
     """A comparison, which starts a process for each core, then needs two thirds of its memory on two."""
     cores = list[int]()
-    monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(log_event=lambda *_: None))
     monkeypatch.setattr(stages, "compare", lambda tell: cores.append(usable_cores()))
-    _run("topic", _Call("compare", "compare", {}, str(tmp_path / "lock"), 0.0, 0.0, died))
-    assert cores == [1 if died else usable_cores()]
+    _run("compare", {}, str(tmp_path / "lock"), alone=alone, news=tmp_path / "news")
+    assert cores == [1 if alone else usable_cores()]
 
 
 @pytest.mark.full_size

@@ -1,0 +1,72 @@
+"""A stage in a process of its own, which gives all of its memory back at its end and may die alone."""
+
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from dvc.atomic_files import write_whole
+from dvc.errors import MrstrainError, WorkerError
+from dvc.memory import is_lack_of_memory
+from dvc.threads import on_one_core, usable_cores
+from dvc.worker import Worker, in_this_process
+from mrstrain.records.outcome import lack_of_machine
+from mrstrain.studies import stages
+from mrstrain.studies.stages import StageResult, Tell
+
+Outcome = StageResult | WorkerError | str
+"""The result of a stage; how a process of it died; or why it failed."""
+_SOLVES = ("simulate", "vary", "drive")  # stages that do nothing but compute on one thread
+_TELL_EVERY_S = 1.0
+_A_FAULT = "This is an error in mrstrain; please report it:\n"
+
+
+def run_stage(
+    name: str, function: str, arguments: Mapping[str, Any], lock: str, tell: Tell, *, alone: bool = False
+) -> Outcome:
+    """Run a stage under its lock; its errors are returned.
+
+    ``function`` is one of `mrstrain.studies.stages`. With ``alone``, it uses one core.
+    """
+    with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
+        news = Path(folder) / "news"
+
+        def watch() -> None:
+            if news.exists():
+                what, _, fraction = news.read_text(encoding="utf-8").rpartition("\n")
+                tell(what, float(fraction))
+
+        with Worker(1 if function in _SOLVES else usable_cores()) as process:
+            try:
+                return process.run(f"running {name}", _run, function, dict(arguments), lock, alone, news, watch=watch)
+            except WorkerError as death:
+                return WorkerError(str(death))
+
+
+def _run(function: str, arguments: dict[str, Any], lock: str, alone: bool, news: Path) -> Outcome:
+    told_at = -_TELL_EVERY_S
+
+    def tell(what: str, fraction: float) -> None:
+        nonlocal told_at
+        now = time.monotonic()
+        if fraction >= 1.0 or now - told_at >= _TELL_EVERY_S:
+            told_at = now
+            write_whole(news, f"{what}\n{float(fraction)}")
+
+    stage: Callable[..., StageResult] = getattr(stages, function)
+    here = in_this_process() if function in _SOLVES else nullcontext()
+    try:
+        with FileLock(lock), on_one_core() if alone else nullcontext(), here:
+            return stage(tell, **arguments)
+    except WorkerError as death:
+        return WorkerError(str(death))
+    except MrstrainError as error:
+        return str(error)
+    except Exception as error:
+        lack = lack_of_machine(error)
+        return WorkerError(lack) if is_lack_of_memory(error) else lack or _A_FAULT + traceback.format_exc()
