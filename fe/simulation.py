@@ -44,8 +44,8 @@ class Simulation:
     paths : tuple of tuple of LoadStep
         The requested loads, each path in the order of simulation.
     states : tuple of LoadState
-        Results in that order. On an incomplete path, the last one has ``reached`` below 1; the path has none if a load
-        that it passes was not reached.
+        Results, in the order in which the loads were requested. On an incomplete path, the last one has ``reached``
+        below 1; the path has none if a load that it passes was not reached.
     fixed : tuple of str
         Fixed surface sets.
     element : str
@@ -74,14 +74,16 @@ class Simulation:
         object.__setattr__(self, "regions", tuple(rows))
 
     @classmethod
-    def of(cls, materials: MaterialSet, problems: Sequence[Problem], states: Sequence[LoadState]) -> Self:
-        """The simulation of these problems, one for each path, with the final states of their loads."""
-        first = problems[0]
+    def of(
+        cls, materials: MaterialSet, problems: Sequence[Problem], states: Sequence[LoadState], loads: Sequence[LoadStep]
+    ) -> Self:
+        """The simulation of these problems, one for each path, with the final states of the requested loads."""
+        first, order = problems[0], [load.name for load in loads]
         by_region, remarks = materials.for_regions(first.mesh.regions)
         remarks += tuple(note for one in problems for note in one.notes)
         return cls(
             replace(materials, materials=by_region), first.mesh, tuple(tuple(one.loads) for one in problems),
-            tuple(states), tuple(first.fixed), first.element, first.plate.turns, remarks,
+            tuple(sorted(states, key=lambda state: order.index(state.load.name))), tuple(first.fixed), first.element, first.plate.turns, remarks,
         )  # fmt: skip
 
     @property
@@ -392,4 +394,4 @@ def simulate(
     problems = problems_of(mesh, by_region, plate, loads, fixed, element)
     for note in (*notes, *(note for one in problems for note in one.notes)):
         observer.log(note)
-    return Simulation.of(chosen, problems, solve_paths(problems, options, observer))
+    return Simulation.of(chosen, problems, solve_paths(problems, options, observer), loads)

@@ -96,12 +96,14 @@ class _Client:
 def stages_run_here() -> Iterator[None]:
     """Stages of studies and their tasks run in this process: a cluster costs ten seconds of imports in each run."""
     from mrstrain.studies import cluster
+    from mrstrain.studies.stage_process import outcome_of
 
     @contextmanager
     def here(watch: Callable[[str, str, float], None], *_: object, **__: object) -> Iterator[cluster.StageRunner]:
         with pytest.MonkeyPatch.context() as patch:
             client = _Client()
             patch.setattr(cluster, "get_worker", lambda: client)
+            patch.setattr(cluster, "run_stage", lambda _name, *given, **how: outcome_of(*given, **how))
             yield cluster.StageRunner(client, watch)  # type: ignore[arg-type]
 
     with tasks_run_here(), pytest.MonkeyPatch.context() as patch:

@@ -8,6 +8,7 @@ degree rises until the residual of the measured field's reconstruction is accept
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
+from math import comb
 from typing import Self
 
 import numpy as np
@@ -65,7 +66,8 @@ class TissueBasis:
         low, high = points_mm.min(axis=0), points_mm.max(axis=0)
         inside = 2.0 * (points_mm - low) / np.maximum(high - low, 1e-12) - 1.0
         along, root = [legvander(x, MOST_DEGREE) for x in inside.T], np.sqrt(weights)
-        made = np.zeros((len(points_mm), 0))
+        room = np.empty((len(points_mm), comb(MOST_DEGREE + 3, 3)), order="F")  # one place for all bases
+        made = room[:, :0]
         for degree in range(MOST_DEGREE + 1):
             orders = [(i, j, degree - i - j) for i in range(degree + 1) for j in range(degree + 1 - i)]
             products = [along[0][:, i] * along[1][:, j] * along[2][:, k] * root for i, j, k in orders]
@@ -74,7 +76,8 @@ class TissueBasis:
                 further = _orthonormal(further - made @ (made.T @ further))
             if degree and _CELLS_EACH * (made.shape[1] + further.shape[1]) > len(points_mm):
                 return
-            made = np.hstack([made, further])
+            known, made = made.shape[1], room[:, : made.shape[1] + further.shape[1]]
+            made[:, known:] = further
             yield cls(made, weights, degree)
 
     @property

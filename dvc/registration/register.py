@@ -26,6 +26,7 @@ from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Image, LabelMap, Mask, reordered_to_lps
 from dvc.images.noise import Noise, noise_of
 from dvc.images.tissue import bright_voxels, tissue_mask
+from dvc.memory import hand_memory_back
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.registration.bone_mask import mirrored_doubt
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
@@ -204,6 +205,7 @@ def register(
         elif start is not None:
             there = RigidMotion(turn.T, np.zeros(3))
             guess = Composed([there.inverse(), start, there])
+        beside.submit(hand_memory_back)  # the worker takes its largest amount now
         found = engine.find(pair, start=guess, seeds=_seeds(chosen)[1:], worker=runner, progress=tell)
     return Registration(
         reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,

@@ -116,7 +116,7 @@ def simulate(
     at_once = max(1, min(cores.workers or usable_cores(), len(jobs)))
     each = cores.threads or max(1, usable_cores() // at_once)
     options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
-    run = _Run(target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
+    run = _Run(target, loads, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
     with ExitStack() as held_folders:
         for folder in (target / one.name for one in chosen):
             make_output(folder)
@@ -181,6 +181,7 @@ class _Run:
     """Solves load paths in workers, and writes the tables of a set as soon as its last path is solved."""
 
     target: Path
+    loads: Sequence[fe.LoadStep]
     jobs: Sequence[tuple[fe.MaterialSet, fe.Problem]]
     record: Callable[[fe.Simulation], dict[str, object]]
     decks: bool
@@ -230,7 +231,7 @@ class _Run:
         states = [state for one in problems for state in self.ended[id(one)]]
         if not states:
             return
-        made, folder = fe.Simulation.of(chosen, problems, states), self.target / chosen.name
+        made, folder = fe.Simulation.of(chosen, problems, states, self.loads), self.target / chosen.name
         try:
             if self.decks:
                 made.write_decks(folder)

@@ -43,12 +43,13 @@ def run_stage(
 
         with Worker(1 if function in _SOLVES else usable_cores()) as process:
             try:
-                return process.run(f"running {name}", _run, function, dict(arguments), lock, alone, news, watch=watch)
+                return process.run(f"running {name}", _child, function, dict(arguments), lock, alone, news, watch=watch)
             except WorkerError as death:
                 return WorkerError(str(death))
 
 
-def _run(function: str, arguments: dict[str, Any], lock: str, alone: bool, news: Path) -> Outcome:
+def _child(function: str, arguments: Mapping[str, Any], lock: str, alone: bool, news: Path) -> Outcome:
+    """Run a stage in this process, which is its own; its progress is written to the file ``news``."""
     told_at = -_TELL_EVERY_S
 
     def tell(what: str, fraction: float) -> None:
@@ -58,10 +59,15 @@ def _run(function: str, arguments: dict[str, Any], lock: str, alone: bool, news:
             told_at = now
             write_whole(news, f"{what}\n{float(fraction)}")
 
+    with in_this_process() if function in _SOLVES else nullcontext():
+        return outcome_of(function, arguments, lock, tell, alone=alone)
+
+
+def outcome_of(function: str, arguments: Mapping[str, Any], lock: str, tell: Tell, *, alone: bool) -> Outcome:
+    """Run a stage in this process; parameters as in `run_stage`."""
     stage: Callable[..., StageResult] = getattr(stages, function)
-    here = in_this_process() if function in _SOLVES else nullcontext()
     try:
-        with FileLock(lock), on_one_core() if alone else nullcontext(), here:
+        with FileLock(lock), on_one_core() if alone else nullcontext():
             return stage(tell, **arguments)
     except WorkerError as death:
         return WorkerError(str(death))

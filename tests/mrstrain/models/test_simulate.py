@@ -70,7 +70,7 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
     for name in ("luboz", "mine"):
         folder = tmp_path / "sim" / name
         told = json.loads((folder / "simulation.json").read_text())
-        assert list(told["outcome"]) == ["Load2", "Load3", "Load1"]  # by path
+        assert list(told["outcome"]) == ["Load3", "Load2", "Load1"]  # as asked for
         assert set(told["parameters"]["laws"]) == {"fat", "skin"}
         assert told["outcome"]["Load3"]["plate_force_n"] == pytest.approx([2, 1, 0], abs=2e-3)
         assert [file["name"] for file in told["inputs"]["mesh"]] == ["dome.vtu", "dome.json"]

@@ -26,7 +26,7 @@ from mrstrain.studies.cluster import StageRunner, _Call
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
 from mrstrain.studies.run import _log
-from mrstrain.studies.stage_process import _run
+from mrstrain.studies.stage_process import outcome_of
 from mrstrain.studies.stages import StageResult
 from tests.mrstrain.studies import test_pipeline
 from tests.mrstrain.studies.test_pipeline import ALL, Here, ran, stages_in
@@ -84,7 +84,7 @@ def ended_by(failure: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch) 
         raise failure
 
     monkeypatch.setattr(stages, "mesh", failing)
-    return _run("mesh", {}, str(folder / "lock"), alone=False, news=folder / "news")
+    return outcome_of("mesh", {}, str(folder / "lock"), lambda *_: None, alone=False)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, alone):
     """A comparison, which starts a process for each core, then needs two thirds of its memory on two."""
     cores = list[int]()
     monkeypatch.setattr(stages, "compare", lambda tell: cores.append(usable_cores()))
-    _run("compare", {}, str(tmp_path / "lock"), alone=alone, news=tmp_path / "news")
+    outcome_of("compare", {}, str(tmp_path / "lock"), lambda *_: None, alone=alone)
     assert cores == [1 if alone else usable_cores()]
 
 
