@@ -45,7 +45,7 @@ def one(place: Path, material_set: str, step_mm: float | None, strains: Path | N
     """Solve the loads in this process, with the code that it imports; also write max. shear strain and volumes."""
     assert Path(fe.__file__).parents[1] == Path(os.environ["PYTHONPATH"]), "the code of another tree is imported"
     if step_mm:
-        fe.load_path._APPROACH_MM = fe.load_path._MOST_APPROACH_MM = step_mm
+        fe.load_path._FIRST_MM = fe.load_path._MOST_MM = (step_mm, step_mm)
     mesh, plate = fe.read_tet_mesh(place), fe.Plate(*PLATE)
     fe.simulate(mesh, material_set, plate, [fe.LoadStep("compiles", 0.05)])
     began = time.process_time()

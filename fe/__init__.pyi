@@ -11,7 +11,8 @@ from .convergence import (
 from .decks import write_calculix, write_febio
 from .fitting import LAWS, Curve, Fit, fit, read_curves
 from .from_dvc import InputError, MrstrainError, OutputError, TetMesh, WorkerError
-from .load_path import Checkpoint, PlateState
+from .load_path import PlateState
+from .loading import Checkpoint
 from .materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh
 from .mesh_file import BONE, CUT, SKIN, fixed_facets, read_tet_mesh, write_tet_mesh
 from .meshing import MeshQuality, check_meshing, mesh_labels

@@ -1,9 +1,7 @@
 """Load paths: a plate pressed against tissue in a sequence of loads and converged increments."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,17 +23,18 @@ _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
 _TIPPING = 0.5  # fraction of the parallel plate's indentation: a released plate above it has tipped over
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
-_APPROACH_MM, _MOST_APPROACH_MM = 0.25, 1.0
+# Steps of a plate that is moved along the normal, and along the shear. If only shorter ones converge, its force is
+# raised instead, with the help of viscous descent.
+_FIRST_MM, _MOST_MM, _LEAST_MM = (0.25, 1.0), (1.0, 3.0), (0.01, 0.25)
 _MOST_OTHERWISE_MM = 0.6  # under displacement control, and with a plate that rotates: 1.0 is less exact (decision 7)
-_LEAST_APPROACH_MM = 0.01
+_CLOSE_MM = 0.01
 # With a material whose stiffness is far from every published one, or whose stress falls, and below this fraction of the
 # normal load: least steps, of a stage and mm. Where they fail, smaller ones and viscous descent took minutes to fail.
 _EARLY, _LEAST_DOUBTED, _LEAST_DOUBTED_MM = 0.5, 1.0 / 32.0, 0.1
-_ALONG_NORMAL = np.array([True, False, False])
-# Fraction of the normal load up to which the plate is displacement controlled, so that nodes touch it in order. A plate
-# that rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
+# Fraction of a force up to which the plate is displacement controlled, so that nodes touch it in order. A plate that
+# rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
 _ENOUGH, _RELEASED = 0.8, (0.2, 0.4, 0.6, 0.8)
-_AIM = 0.9  # of the normal load, for the last step on the way there
+_AIM, _LEAST_KNOWN = 0.9, 0.01  # of the force: for the last step on the way there; from which on its growth is known
 _ROUGH_FORCE, _ROUGH_STEP = 10.0, 30.0  # factors on the tolerance of increments on the way there
 
 
@@ -114,7 +113,7 @@ class LoadPath:
                 if part.values[0] > self.plate.displacement_mm[0] and not self.raise_to(part):
                     return False
             else:
-                self._push(share * target.values[0], target.values[0])
+                self._move(0, target.unsheared(), share)
             if self.is_over():
                 return False
             if not self.contact.plate.turns or self._let_go():
@@ -141,10 +140,21 @@ class LoadPath:
         return left == 0.0
 
     def press(self, target: PlateTarget) -> bool:
-        """Continue to the normal load, in one step if the approach has come near; whether it is reached."""
+        """Continue to the normal load; whether it is reached."""
         free = self.contact.plate.turns or target.displaced[0]
-        near = not free and self.plate.force_n[0] >= _ENOUGH * target.values[0]
-        return self.raise_to(target.unsheared(), 1.0 if near else _FIRST_STEP)
+        return self.raise_to(target.unsheared(), _FIRST_STEP if free else self._last_step(0, target))
+
+    def shear(self, target: PlateTarget) -> bool:
+        """Continue to the shear, to a force by displacing the plate unless it rotates; whether it is reached."""
+        if self.contact.plate.turns or target.displaced.any():
+            return self.raise_to(target)
+        self._move(1, target, _ENOUGH)
+        return self.raise_to(target, self._last_step(1, target))
+
+    def _last_step(self, axis: int, target: PlateTarget) -> float:
+        """First step to a force, as a fraction: the whole way where the displaced plate has come near."""
+        near = abs(self.plate.force_n[axis]) >= _ENOUGH * abs(target.values[axis])
+        return 1.0 if near else _FIRST_STEP
 
     def raise_to(self, target: PlateTarget, first: float = _FIRST_STEP) -> bool:
         """Continue to the target, in steps as large as converge, the first a given fraction; whether it is reached."""
@@ -170,52 +180,52 @@ class LoadPath:
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 
-    def _push(self, enough_n: float, most_n: float) -> None:
-        """Move the plate along its normal until its force is ``enough_n`` or cannot rise; never above ``most_n``."""
-        farthest = self.plate.displacement_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
-        largest, exact = self._most_mm, self.tolerance
+    def _move(self, axis: int, target: PlateTarget, share: float) -> None:
+        """Displace the plate along an axis until its force is a fraction of the target's, or cannot rise; never above.
+
+        Along the other axes it has the forces of the target.
+        """
+        aim_n = float(target.values[axis])
+        ahead = 1.0 if aim_n > 0.0 else -1.0
+        farthest = self._moved(axis, ahead) + float(np.ptp(self.model.space.nodes_mm[:, axis]))
+        largest, exact = _MOST_OTHERWISE_MM if self.contact.plate.turns else _MOST_MM[axis], self.tolerance
         rough = replace(exact, force=_ROUGH_FORCE * exact.force, step_mm=_ROUGH_STEP * exact.step_mm)
-        while self.plate.force_n[0] < enough_n and largest > _LEAST_APPROACH_MM and not self.is_over():
-            step = min(largest, self._to_next_stop(), self._to_force(_AIM * most_n))
-            if farthest - self.plate.displacement_mm[0] < step:
+        most = largest
+        while (
+            ahead * self.plate.force_n[axis] < share * abs(aim_n) and largest > _LEAST_MM[axis] and not self.is_over()
+        ):
+            moved_mm = self._moved(axis, ahead)
+            step = min(largest, _to_next_stop(moved_mm, _FIRST_MM[axis], most), self._to_force(axis, _AIM * aim_n))
+            if farthest - moved_mm < step:
                 break
-            last = self.increment
-            aim = np.array([self.plate.displacement_mm[0] + step, 0.0, 0.0])
-            converged = self._go(_ALONG_NORMAL, aim, tolerance=rough)
-            if converged and self.plate.force_n[0] < most_n:
-                self._log("moved")
+            last, aim = self.increment, target.values.copy()
+            aim[axis] = self._start_mm[axis] + ahead * (moved_mm + step)
+            converged = self._go(np.arange(3) == axis, aim, tolerance=rough)
+            if converged and ahead * self.plate.force_n[axis] < abs(aim_n):
+                self._log(("moved", "sheared")[axis])
                 self.on_converged()
                 continue
             self._back(last)
             largest = _SHRINK * step
-            if not converged and largest < _LEAST_DOUBTED_MM and self._hopeless(self.plate.force_n[0], most_n):
+            early = self._hopeless(self.plate.force_n[0], target.values[0])
+            if not converged and early and largest < _LEAST_DOUBTED_MM:
                 break
+
+    def _moved(self, axis: int, ahead: float) -> float:
+        """Displacement of the plate along an axis, or against it, since it touched the tissue, mm."""
+        return ahead * float(self.plate.displacement_mm[axis] - self._start_mm[axis])
 
     def _hopeless(self, reached: float, normal: float) -> bool:
         """Whether no smaller step is tried after one that failed: far from the normal load, with a doubted material."""
         return self._doubted and reached < _EARLY * normal
 
-    def _to_force(self, force_n: float) -> float:
-        """Step of the approach to a force, mm, if the force goes on to grow by the same factor with each mm."""
-        before, now = self.curve[-2:] if len(self.curve) > 1 else 2 * self.curve
-        moved_mm = now.displacement_mm[0] - before.displacement_mm[0]
-        if not (force_n > now.force_n[0] > before.force_n[0] > 0.0 and moved_mm > _LEAST_APPROACH_MM):
-            return np.inf
-        rates = np.log([now.force_n[0] / before.force_n[0], force_n / now.force_n[0]])
-        return float(moved_mm * rates[1] / rates[0])
-
-    @property
-    def _most_mm(self) -> float:
-        """Longest step of the approach under force control, mm."""
-        return _MOST_OTHERWISE_MM if self.contact.plate.turns else _MOST_APPROACH_MM
-
-    def _to_next_stop(self) -> float:
-        """Step of the approach, mm; unless steps have failed, it has the same stops wherever it is resumed."""
-        moved_mm = self.plate.displacement_mm[0] - self._start_mm[0]
-        stop, step = 0.0, _APPROACH_MM
-        while stop < moved_mm + _LEAST_APPROACH_MM:
-            stop, step = stop + step, min(_GROWTH * step, self._most_mm)
-        return float(stop - moved_mm)
+    def _to_force(self, axis: int, force_n: float) -> float:
+        """Step along an axis to a force, mm, if the force goes on to grow by the same factor with each mm."""
+        ends = self.curve[-2:] if len(self.curve) > 1 else 2 * self.curve
+        before, now = (end.force_n[axis] / force_n for end in ends)
+        moved_mm = abs(ends[1].displacement_mm[axis] - ends[0].displacement_mm[axis])
+        grows = _LEAST_KNOWN < before < now < 1.0 and moved_mm > _CLOSE_MM
+        return float(moved_mm * np.log(now) / np.log(before / now)) if grows else np.inf
 
     def _go(
         self, displaced: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0, *, downhill: bool = False,
@@ -291,90 +301,9 @@ class LoadPath:
         self.log(f"{what}: displacement {moved} mm, force {force} N, {nodes} nodes on the plate{turned}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Checkpoint:
-    """State from which a simulation continues: the end of a load, or a converged increment within it.
-
-    Attributes
-    ----------
-    reached : float
-        Fraction of the change from the previous load that is reached, 1 at the end of the load. If the load changes
-        several axes, that of the axis where it is smallest.
-    stages : int
-        Completed stages of the load; for the first load of a path, the approach of the plate is one.
-    curve : tuple of PlateState
-        State of the plate at every converged increment, from that of the previous load to this one.
-    iterations : int
-        Newton iterations since the previous load, without those of failed increments; those of loads that are passed
-        count, as they do in ``curve`` and ``seconds``.
-    unknowns : (unknowns,)
-        Displacements, along the plate's axes, and pressures.
-    """
-
-    reached: float
-    stages: int
-    curve: tuple[PlateState, ...]
-    iterations: int
-    seconds: float
-    unknowns: FloatArray
-    contact: ContactStatus
-
-
-class Loading:
-    """A load in progress, which starts from the end of the previous load of its path.
-
-    ``before`` is the target of the previous load, None for the first load, which starts with the approach. ``earlier``
-    is the checkpoint of this load in an earlier solution. ``on_converged`` is called at each converged increment with a
-    checkpoint and the fraction done.
-    """
-
-    def __init__(
-        self, path: LoadPath, target: PlateTarget, before: PlateTarget | None, earlier: Checkpoint | None,
-        on_converged: Callable[[Checkpoint, float], None],
-    ) -> None:  # fmt: skip
-        self._path, self._target, self._first = path, target, before is None
-        self._before = path.reached(target)
-        if before is not None:  # the target itself, not the values reached within the tolerance
-            self._before = np.where(target.displaced == before.displaced, before.values, self._before)
-        self._began, self._counted = time.monotonic() - (earlier.seconds if earlier else 0.0), path.iterations
-        self._stages, self._complete = 0, False
-        path.solver.forget()  # so that a load depends only on its start, not on earlier solutions
-        path.assembler.forget()
-        path.curve = path.curve[-1:]
-        if earlier is not None:
-            path.curve = list(earlier.curve)
-            path.resume((earlier.unknowns, earlier.curve[-1], earlier.contact))
-            self._stages, self._counted = earlier.stages, path.iterations - earlier.iterations
-        if before is None:  # from the first touch, whatever it passes
-            self._before = np.where(target.displaced, path.curve[0].displacement_mm, path.curve[0].force_n)
-        path.on_converged = lambda: on_converged(self.checkpoint(), float(np.clip(self._shares(), 0.0, 1.0).mean()))
-
-    def run(self) -> bool:
-        """Load up to the target, normal first, then shear; whether it is reached."""
-        path, target = self._path, self._target
-        stages = [partial(path.raise_to, target)]
-        if self._first:
-            stages = [partial(path.approach, target), partial(path.press, target), *(stages if target.sheared else [])]
-        for stage in stages[self._stages :]:
-            if not stage():
-                return False
-            self._stages += 1
-        self._complete = True
-        return True
-
-    def checkpoint(self) -> Checkpoint:
-        """Checkpoint of the current state."""
-        path = self._path
-        reached = 1.0 if self._complete else max(0.0, float(self._shares().min(initial=1.0)))
-        return Checkpoint(
-            reached, self._stages, tuple(path.curve), path.iterations - self._counted,
-            time.monotonic() - self._began, path.state, path.contact.status,
-        )  # fmt: skip
-
-    def _shares(self) -> FloatArray:
-        """Fraction reached of the load's change, along each of the plate's axes that it changes."""
-        way = self._target.values - self._before
-        adds = way != 0.0
-        if not adds.any():
-            return np.ones(1)
-        return np.asarray((self._path.reached(self._target) - self._before)[adds] / way[adds])
+def _to_next_stop(moved_mm: float, first_mm: float, most_mm: float) -> float:
+    """Step of a plate that has moved, mm; unless steps have failed, it has the same stops wherever it is resumed."""
+    stop, step = 0.0, first_mm
+    while stop < moved_mm + _CLOSE_MM:
+        stop, step = stop + step, min(_GROWTH * step, most_mm)
+    return float(stop - moved_mm)

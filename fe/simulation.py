@@ -83,7 +83,8 @@ class Simulation:
         remarks += tuple(note for one in problems for note in one.notes)
         return cls(
             replace(materials, materials=by_region), first.mesh, tuple(tuple(one.loads) for one in problems),
-            tuple(sorted(states, key=lambda state: order.index(state.load.name))), tuple(first.fixed), first.element, first.plate.turns, remarks,
+            tuple(sorted(states, key=lambda state: order.index(state.load.name))), tuple(first.fixed), first.element,
+            first.plate.turns, remarks,
         )  # fmt: skip
 
     @property

@@ -15,7 +15,8 @@ from dvc.errors import InputError
 from dvc.mesh import outer_faces
 from dvc.own_files import read_arrays, read_json
 from dvc.software import software_key
-from fe.load_path import Checkpoint, PlateState
+from fe.load_path import PlateState
+from fe.loading import Checkpoint
 from fe.materials import from_vector
 from fe.mesh_file import BONE, SKIN
 from fe.plate import ContactStatus

@@ -12,7 +12,8 @@ from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray
 from dvc.memory import hand_memory_back
 from fe.elements import Model, element
-from fe.load_path import Checkpoint, Loading, LoadPath, PlateState
+from fe.load_path import LoadPath, PlateState
+from fe.loading import Checkpoint, Loading
 from fe.newton import Tolerance
 from fe.problem import LoadStep, Problem
 

@@ -17,7 +17,7 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError
 from dvc.mesh import faces_of, signed_volumes
 from fe.hyperelastic import OGDEN
-from fe.load_path import Checkpoint
+from fe.loading import Checkpoint
 from fe.materials import HIGHEST_NU, Material, Materials
 from fe.mesh_file import BONE, SKIN
 from fe.plate import Plate

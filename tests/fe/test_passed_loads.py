@@ -167,8 +167,8 @@ def test_nodes_touch_in_the_order_of_small_steps(monkeypatch: pytest.MonkeyPatch
 
     plain = nodes()
     with monkeypatch.context() as fine:
-        fine.setattr("fe.load_path._MOST_APPROACH_MM", 0.05)
-        fine.setattr("fe.load_path._APPROACH_MM", 0.05)
+        fine.setattr("fe.load_path._FIRST_MM", (0.05, 0.05))
+        fine.setattr("fe.load_path._MOST_MM", (0.05, 0.05))
         fine.setattr("fe.load_path._ENOUGH", 0.98)
         fine.setattr("fe.load_path._AIM", 0.99)
         small = nodes()
