@@ -101,7 +101,7 @@ class Comparison:
         if len(self.coverage_ml) > 1 and self.ranking.areas:
             informative = ALL_LOADS not in self.ranking.uninformative
             listed = _listed(self.ranking.areas, self.ranking.nothing, informative)
-            lines.append(f"All loads{'' if informative else ' (not informative)'}: {listed}")
+            lines.append(f"All loads, area in mL{'' if informative else ' (not informative)'}: {listed}")
         return [*lines, *self.ranking.statements, *self.notes]
 
     def __str__(self) -> str:
@@ -336,7 +336,7 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] =
         return None
     distrust, caution = ([r for v in verdicts if v.level == level for r in v.reasons] for level in LEVELS[:0:-1])
     registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
-    sound = f"{registrations} can be trusted. The models are compared below."
+    sound = f"{registrations} can be trusted. This is no verdict on the models, which are compared below."
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 

@@ -125,9 +125,16 @@ def _under(one: LoadComparison, pairs: Pairs) -> str:
 
 
 def _statement(where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str) -> str:
-    """The best model, and models not distinguishable from it or from their neighbours; "" for a single model."""
-    if len(ranked) < 2:
+    """The best model, and models not distinguishable from it or from their neighbours; of a single model, its area."""
+    if not ranked:
         return ""
+    if len(ranked) == 1:
+        (one,) = ranked
+        return (
+            f"Area between the strain-volume curves of {one.model} and the measurement {where}: {one.best_ml:.2f} mL "
+            f"({one.low_ml:.2f} to {one.high_ml:.2f}). It is {nothing.best_ml:.2f} mL for a model without deformation."
+            + caveat
+        )
     best, *others = (a.model for a in ranked)
     near = [b for a, b in pairs if a == best]
     neighbours = [f"{a} and {b}" for a, b in pairwise(others) if (a, b) in pairs]

@@ -165,7 +165,8 @@ def drawings_of_all(
     """The first figures of a report, by the stem of their files: slices and curves under all loads."""
     model = ranking.areas[0].model if ranking.areas else next(n for n in strips[0].max_shear if n != MEASURED)
     informative = ranking.areas and ALL_LOADS not in ranking.uninformative
-    best = "the best match over all loads" if informative else "a model"
+    only = sum(not area.levelled for area in ranking.areas) == 1
+    best = "the only model" if only else "the best match over all loads" if informative else "a model"
     note = f"Upper row: measured. Lower row: {model}, {best}. {strips[0].title}, through {strips[0].place}."
     slices, of_all = (strips, (MEASURED, model)), [curve for curve in curves if curve.tissue == ALL]
     return {

@@ -132,6 +132,10 @@ def spline_in(folder: Path) -> Deformation:
 def read_quality(folder: Path) -> dict[str, Any]:
     """The content of ``quality.json``."""
     path = folder / QUALITY
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: there is no such folder. Name the folder of one load's results, such as results/Load1."
+        )
     try:
         return read_json(path)
     except (OSError, ValueError) as failure:

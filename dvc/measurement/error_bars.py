@@ -108,12 +108,13 @@ def error_bars(
     sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
     sure = replace(sure, components=components_of(maps, regions, to_bone, table, wider))
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
+    own_errors = f"Errors of their own: {known}; all other tissues use" if known else "All tissues use"
     voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
     other = "" if own == voxel else f" (these images: voxels of {own} mm)"
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
-        f"{chosen.source}. Tissues with errors of their own: {known or 'none'}; all others use the pooled errors of "
-        f"soft tissue. {_held(table)} The model applies to tissue that is strained and imaged like these phantoms."
+        f"{chosen.source}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies to tissue "
+        "that is strained and imaged like these phantoms."
     )
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
 

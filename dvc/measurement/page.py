@@ -177,8 +177,10 @@ def error_tables(bars: ErrorBars) -> list[Table]:
     """The intervals, and the errors in the synthetic warp."""
     tables = []
     if bars.uncertainty is not None:
-        rows = tuple((i.region, _words(i.statistic), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
-        columns = ("region", "statistic", "measured", "95 % interval from", "to")
+        rows = tuple(
+            (i.region, _words(i.statistic), i.found, i.estimate, i.low, i.high) for i in bars.uncertainty.intervals
+        )
+        columns = ("region", "statistic", "measured", "bias removed", "95 % interval from", "to")
         tables.append(Table("Maximum shear strain with 95 % intervals", columns, rows, bars.explanation))
         if bars.uncertainty.components is not None:
             tables.append(_component_table(bars.uncertainty.components))

@@ -13,6 +13,7 @@ from dvc.errors import InputError
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.io.meshes.read import MeshFile
+from dvc.trust.error_model import POOLED
 
 _BONES = {
     "bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform", "metatarsal",
@@ -106,12 +107,12 @@ class Subject:
         return body.inside if self.bone is None else body.inside & ~self.bone.inside
 
     def regions(self, body: Mask) -> LabelMap:
-        """The labels; without, the body as "tissue", and the bone."""
+        """The labels; without, the body as "soft tissue", and the bone."""
         if self.labels is not None:
             return self.labels
         if self.bone is None:
-            return LabelMap(body.grid, body.inside.astype(np.int64), {1: "tissue"})
-        return LabelMap(body.grid, np.where(self.bone.inside, 2, body.inside), {1: "tissue", 2: "bone"})
+            return LabelMap(body.grid, body.inside.astype(np.int64), {1: POOLED})
+        return LabelMap(body.grid, np.where(self.bone.inside, 2, body.inside), {1: POOLED, 2: "bone"})
 
 
 def plate_directions(

@@ -95,6 +95,8 @@ def main() -> None:
     """Entry point: errors made on purpose are printed as sentences, with exit status 2."""
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     _share_arenas()
+    # What removes the semaphores of processes that an interrupt ended need not tell of them.
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     signal.signal(signal.SIGINT, _interrupted)

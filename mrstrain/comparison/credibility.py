@@ -234,6 +234,7 @@ def _factors(held: Holdings) -> Table:
     )
     conditions = "; ".join(dict.fromkeys(f"{step.name} {step}" for one in models for step in one.steps))
     known = held.comparison is not None
+    loads = f"{len(held.verdicts)} load{'s' if len(held.verdicts) != 1 else ''}"
     compared = "Strain-volume curves, location above thresholds, and cell by cell; see evidence 4"
     rows = (
         ("Software quality assurance", "Tests with each version; versions and hashes of all inputs in the provenance",
@@ -248,7 +249,7 @@ def _factors(held: Holdings) -> Table:
          given.level_model_inputs),
         ("Test samples", f"One subject{f' ({held.subject})' if held.subject else ''}; see Acquisition and measurement",
          given.level_test_samples),
-        ("Test conditions", f"{len(held.verdicts)} loads: {', '.join(held.verdicts)}", given.level_test_conditions),
+        ("Test conditions", f"{loads}: {', '.join(held.verdicts)}", given.level_test_conditions),
         ("Equivalency of input parameters", _equivalent(held), given.level_input_equivalency),
         ("Output comparison", compared if known else NOT_GIVEN, given.level_output_comparison),
         ("Relevance of the quantities of interest", "See Quantities of interest, above",

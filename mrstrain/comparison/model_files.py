@@ -150,13 +150,14 @@ def model_files(
                 notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}; this load is not compared.")
             elif (end := early_end(chosen[load])) and end.certain and not usual.unfinished:
                 notes.append(
-                    f"{name}: the run of {load} {end.reason}; this load is not compared. To compare it all the same, "
-                    "use unfinished (--unfinished, or unfinished = true under [models] in a study file)."
+                    f"{name}: the run of {load} {end.reason}; this load is not compared. To compare it anyway, use "
+                    "--unfinished, or unfinished = true under [models] in a study file."
                 )
             else:
                 files[load].append(ModelFile(name, chosen[load], *reading))
                 if end:
-                    notes.append(f"{name}: the run of {load} {end.reason}. Check that the load was reached.")
+                    asked = "It is compared because of unfinished" if end.certain else "Check that the load was reached"
+                    notes.append(f"{name}: the run of {load} {end.reason}. {asked}.")
                 if stable is not None and stable.get(load, 1.0) < 1.0:
                     notes.append(
                         f"{name}, {load}: a material is not stable (Drucker) at the strain reached, in up to "

@@ -22,8 +22,11 @@ from mrstrain.studies.file import FILE
 
 _UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
 _AGAIN = re.compile(r"again|repeat|rescan|retest", re.IGNORECASE)
-_LOADED = re.compile(r"load[ _-]?[1-9]\d*|loaded", re.IGNORECASE)
+_LOADED = re.compile(r"load[ _-]?[1-9]\d*|loaded|(?<![a-z\d])\d+(\.\d+)?[ _-]?n(?![a-z])", re.IGNORECASE)  # Load1, 140N
 _LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
+_ONE_BONE = re.compile(
+    r"(calcaneus|calcaneum|bone(?!s))[ _-]*seg|seg\w*[ _-]*(calcaneus|calcaneum|bone(?!s))", re.IGNORECASE
+)
 _TO_MESH = re.compile(r"to[ _-]?mesh", re.IGNORECASE)
 _BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
 _VARIANT = "-as-published"  # suffix of sets with another interpretation of the published parameters
@@ -32,6 +35,11 @@ _ROLES = {
     "labels": "the label map", "mesh_labels": "the label map to be meshed", "bone_mask": "the bone",
     "repeat": "the repeat scan", "load": "the load of that name",
 }  # fmt: skip
+_NO_ROLE = "because its name does not indicate a role"
+_NAMES = (
+    "Names that do: Load0 or NAME_unloaded, Load1 or NAME_loaded or NAME_140N, NAME_bone, NAME_labels, Load0-again. "
+    "Rename the images, remove study.toml, and use init again."
+)
 _LOOKED_AT = 20
 PICTURE = "study.png"
 _TO_FILL_IN = "# FILL IN"  # of lines in the template
@@ -85,6 +93,7 @@ class NewStudy:
         lines += [f"Mask of the bone: {found.bone_mask}"] if found.bone_mask else []
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
+        lines += [_NAMES] if _NO_ROLE in found.unused.values() else []
         file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)
         to_fill_in = [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
         todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
@@ -194,7 +203,7 @@ def _look(place: Path) -> StudyInputs:
         if role == "load":
             taken = found.loads.setdefault(image_stem(name), name)
         elif role is None:
-            found.unused[name] = "because its name does not indicate a role"
+            found.unused[name] = _NO_ROLE
             continue
         else:
             taken = getattr(found, role) or name
@@ -236,6 +245,8 @@ def _role(stem: str) -> str | None:
     """Role that the name of an image suggests: a field of `StudyInputs`, or "load"; None if it suggests none."""
     if stem.endswith("_probability"):  # of a label map that `label` made
         return None
+    if _ONE_BONE.search(stem):
+        return "bone_mask"
     if _LABELS.search(stem):
         return "mesh_labels" if _TO_MESH.search(stem) else "labels"
     if _BONE.search(stem):

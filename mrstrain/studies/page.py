@@ -144,7 +144,7 @@ def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdic
     if verdict.reasons:
         return verdict
     registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
-    models = " The models are compared below." if compared else ""
+    models = " This is no verdict on the models, which are compared below." if compared else ""
     return replace(verdict, reasons=(f"{registrations} can be trusted.{models}",))
 
 

@@ -269,7 +269,8 @@ def load_steps(study: Study) -> dict[str, LoadStep]:
         return steps
     why = "Shear needs a normal load." if lacking else "A simulation needs at least one load with a normal load."
     places = [study.at(f"loads.{name}", "normal_n") for name in lacking or study.loads]
-    raise InputError("\n  ".join([f"{why} Give normal_n (N) or normal_mm in the study file:", *places]))
+    measured = "" if lacking else ", or leave out sets under [models] to measure only"
+    raise InputError("\n  ".join([f"{why} Give normal_n (N) or normal_mm in the study file{measured}:", *places]))
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:

@@ -4,14 +4,14 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
 
 from dvc.atomic_files import write_whole
-from dvc.errors import MrstrainError, WorkerError
+from dvc.errors import MrstrainError, OutputError, WorkerError
 from dvc.memory import is_lack_of_memory
 from dvc.threads import on_one_core, usable_cores
 from dvc.worker import Worker, in_this_process
@@ -37,7 +37,7 @@ def run_stage(
         news = Path(folder) / "news"
 
         def watch() -> None:
-            if news.exists():
+            with suppress(OSError):  # there is none yet
                 what, _, fraction = news.read_text(encoding="utf-8").rpartition("\n")
                 tell(what, float(fraction))
 
@@ -57,7 +57,8 @@ def _child(function: str, arguments: Mapping[str, Any], lock: str, alone: bool, 
         now = time.monotonic()
         if fraction >= 1.0 or now - told_at >= _TELL_EVERY_S:
             told_at = now
-            write_whole(news, f"{what}\n{float(fraction)}")
+            with suppress(OutputError):  # a full disk, or the file is being read: the stage goes on
+                write_whole(news, f"{what}\n{float(fraction)}")
 
     with in_this_process() if function in _SOLVES else nullcontext():
         return outcome_of(function, arguments, lock, tell, alone=alone)

@@ -71,7 +71,9 @@ def read_image(
         first = tuple(map(int, np.unravel_index(int(np.argmin(finite)), values.shape)))
         problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
         if not allow_missing:
-            raise InputError(f"{path}: {problem}. Repair the image, or leave these voxels out (allow_missing).")
+            raise InputError(
+                f"{path}: {problem}. Repair the image, or leave these voxels out (allow_missing), as those of a map."
+            )
         _log.warning("%s: %s; treated as missing", path, problem)
         values = np.where(finite, values, np.float32(np.nan))
     low = np.nanmin(values)

@@ -94,7 +94,10 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
         for load in LOADS
     }
     outcomes["compare"] = ended(
-        "compare", "Load1: trebbi 1.0", "All loads: trebbi 2.5", "Best match over all loads (area metric): trebbi."
+        "compare",
+        "Load1: trebbi 1.0",
+        "All loads, area in mL: trebbi 2.5",
+        "Best match over all loads (area metric): trebbi.",
     )
     errors = {x.name: (TissueError("fat", 9, 0.1, 0.44, 0.0221, 0.0, 0.1, 0.1, 0.2, 0),) for x in LOADS}
     lines = _summary(errors, StudyRun(study, outcomes))
@@ -102,7 +105,7 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     assert "Load1 trust" in lines[0]
     assert "Load3 use with care" in lines[0]
     assert "Load4 0.022 of 0.44" in lines[1]
-    assert lines[2:4] == ["All loads: trebbi 2.5", "Best match over all loads (area metric): trebbi."]
+    assert lines[2:4] == ["All loads, area in mL: trebbi 2.5", "Best match over all loads (area metric): trebbi."]
     assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
     outcomes["simulate erdemir"] = ended("simulate erdemir", "erdemir, Load1: ONLY 75% of the load", complete=False)
     lines = _summary(errors, StudyRun(study, outcomes))

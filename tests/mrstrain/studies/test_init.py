@@ -60,6 +60,17 @@ def test_what_has_no_role_is_told_and_stands_in_the_study_file(tmp_path):
     assert told.count("NOT USED") == text.count("NOT USED") == 5
 
 
+def test_names_that_a_laboratory_gives_are_recognised(tmp_path):
+    found = init(folder_of(tmp_path, "heel_unloaded.nii.gz", "heel_140N.nii.gz", "calcaneus_seg.nii.gz")).inputs
+    assert (found.load0, found.loads) == ("heel_unloaded.nii.gz", {"heel_140N": "heel_140N.nii.gz"})
+    assert (found.labels, found.bone_mask, found.unused) == (None, "calcaneus_seg.nii.gz", {})
+
+
+def test_names_that_would_be_recognised_are_listed_beside_those_that_are_not(tmp_path):
+    told = init(folder_of(tmp_path, "Load0.nii.gz", "pressed.nii.gz")).summary()
+    assert "NAME_140N" in next(line for line in told if line.startswith("Names that do"))
+
+
 def test_two_unloaded_images_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"both Load0\.nii\.gz and unloaded\.nii\.gz"):
         init(folder_of(tmp_path, "Load0.nii.gz", "unloaded.nii.gz"))
