@@ -1,5 +1,6 @@
 """A stage in a process of its own: what it tells, and what remains of it when that process dies."""
 
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -60,7 +61,7 @@ def test_tasks_of_a_stage_run_in_its_process() -> None:
     told = list[str]()
     with in_this_process(), Worker(threads=1) as worker:
         assert worker.run("adding", sum, [1, 2], watch=lambda: told.append("watched")) == 3
-        assert worker.run("asking", psutil.Process).pid == psutil.Process().pid
+        assert worker.run("asking", os.getpid) == os.getpid()
         worker.run("sleeping", time.sleep, 1.2, watch=lambda: told.append("slept"))
         with pytest.raises(ZeroDivisionError):
             worker.run("dividing", divmod, 1, 0)
@@ -68,7 +69,7 @@ def test_tasks_of_a_stage_run_in_its_process() -> None:
             worker.run("asking for much", _much)
     assert set(told) == {"slept"}
     with Worker(threads=1) as worker:
-        assert worker.run("asking", psutil.Process).pid != psutil.Process().pid
+        assert worker.run("asking", os.getpid) != os.getpid()
 
 
 def _much() -> None:
