@@ -99,6 +99,8 @@ class Worker(AbstractContextManager["Worker", None]):
 
     def start(self, *modules: str) -> None:
         """Start the child process, and let it import modules and what their loops need, beside the caller."""
+        if _here:
+            return
         with self._lock:
             for module in modules:
                 self._submitted(self._running(), _imported, module)

@@ -34,7 +34,9 @@ _EARLY, _LEAST_DOUBTED, _LEAST_DOUBTED_MM = 0.5, 1.0 / 32.0, 0.1
 # Fraction of a force up to which the plate is displacement controlled, so that nodes touch it in order. A plate that
 # rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
 _ENOUGH, _RELEASED = 0.8, (0.2, 0.4, 0.6, 0.8)
-_AIM, _LEAST_KNOWN = 0.9, 0.01  # of the force: for the last step on the way there; from which on its growth is known
+_AIM = 0.9  # of the force, for the last step on the way there
+_LEAST_KNOWN = (0.0, 0.01)  # of the force along an axis, from which on its growth is known
+_PRESSED = 0.01  # of the normal force, by which it may be off where the plate is sheared by displacing it
 _ROUGH_FORCE, _ROUGH_STEP = 10.0, 30.0  # factors on the tolerance of increments on the way there
 
 
@@ -146,15 +148,16 @@ class LoadPath:
 
     def shear(self, target: PlateTarget) -> bool:
         """Continue to the shear, to a force by displacing the plate unless it rotates; whether it is reached."""
-        if self.contact.plate.turns or target.displaced.any():
+        (normal, shear, _), (normal_n, shear_n, _) = self.plate.force_n, target.values
+        pressed, grows = abs(normal - normal_n) <= _PRESSED * abs(normal_n), shear_n * (shear_n - shear) > 0.0
+        if self.contact.plate.turns or target.displaced.any() or not (pressed and grows):
             return self.raise_to(target)
         self._move(1, target, _ENOUGH)
         return self.raise_to(target, self._last_step(1, target))
 
     def _last_step(self, axis: int, target: PlateTarget) -> float:
         """First step to a force, as a fraction: the whole way where the displaced plate has come near."""
-        near = abs(self.plate.force_n[axis]) >= _ENOUGH * abs(target.values[axis])
-        return 1.0 if near else _FIRST_STEP
+        return 1.0 if self.plate.force_n[axis] / target.values[axis] >= _ENOUGH else _FIRST_STEP
 
     def raise_to(self, target: PlateTarget, first: float = _FIRST_STEP) -> bool:
         """Continue to the target, in steps as large as converge, the first a given fraction; whether it is reached."""
@@ -201,7 +204,9 @@ class LoadPath:
             last, aim = self.increment, target.values.copy()
             aim[axis] = self._start_mm[axis] + ahead * (moved_mm + step)
             converged = self._go(np.arange(3) == axis, aim, tolerance=rough)
-            if converged and ahead * self.plate.force_n[axis] < abs(aim_n):
+            # Beyond the largest shear force that tissue carries, no state is on the way.
+            rises = axis == 0 or ahead * (self.plate.force_n[axis] - last[1].force_n[axis]) > 0.0
+            if converged and rises and ahead * self.plate.force_n[axis] < abs(aim_n):
                 self._log(("moved", "sheared")[axis])
                 self.on_converged()
                 continue
@@ -224,7 +229,7 @@ class LoadPath:
         ends = self.curve[-2:] if len(self.curve) > 1 else 2 * self.curve
         before, now = (end.force_n[axis] / force_n for end in ends)
         moved_mm = abs(ends[1].displacement_mm[axis] - ends[0].displacement_mm[axis])
-        grows = _LEAST_KNOWN < before < now < 1.0 and moved_mm > _CLOSE_MM
+        grows = _LEAST_KNOWN[axis] < before < now < 1.0 and moved_mm > _CLOSE_MM
         return float(moved_mm * np.log(now) / np.log(before / now)) if grows else np.inf
 
     def _go(

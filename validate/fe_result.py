@@ -111,7 +111,7 @@ def read_result(
     place = Path(path)
     is_table = place.suffix.lower() == ".csv"
     if is_table and mesh is None:
-        raise InputError(f"{place}: a table of displacements also needs a file with the mesh: mesh (--model-mesh).")
+        raise InputError(f"{place}: a table of displacements also needs the mesh of its nodes: mesh (--model-mesh).")
     source = read_mesh((is_table and mesh) or place, unit=unit, frame=frame)
     u = (_from_table if is_table else _beside_mesh)(place, source) * MM_PER_UNIT[unit] * TO_LPS[frame]
     try:

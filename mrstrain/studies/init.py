@@ -22,11 +22,12 @@ from mrstrain.studies.file import FILE
 
 _UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
 _AGAIN = re.compile(r"again|repeat|rescan|retest", re.IGNORECASE)
-_LOADED = re.compile(r"load[ _-]?[1-9]\d*|loaded|(?<![a-z\d])\d+(\.\d+)?[ _-]?n(?![a-z])", re.IGNORECASE)  # Load1, 140N
+_LOADED = re.compile(
+    r"load[ _-]?[1-9]\d*|loaded|(?<![a-z\d.])[1-9]\d+(\.\d+)?n(?![a-z\d])", re.IGNORECASE
+)  # Load1, 140N
 _LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
-_ONE_BONE = re.compile(
-    r"(calcaneus|calcaneum|bone(?!s))[ _-]*seg|seg\w*[ _-]*(calcaneus|calcaneum|bone(?!s))", re.IGNORECASE
-)
+_ONE_BONE = re.compile(r"(.*[ _-])?(calcaneus|calcaneum|bone)[ _-]*seg(mentation)?", re.IGNORECASE)
+_SEVERAL = re.compile(r"label|tissue|fat|muscle|skin|to[ _-]?mesh", re.IGNORECASE)
 _TO_MESH = re.compile(r"to[ _-]?mesh", re.IGNORECASE)
 _BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
 _VARIANT = "-as-published"  # suffix of sets with another interpretation of the published parameters
@@ -245,7 +246,7 @@ def _role(stem: str) -> str | None:
     """Role that the name of an image suggests: a field of `StudyInputs`, or "load"; None if it suggests none."""
     if stem.endswith("_probability"):  # of a label map that `label` made
         return None
-    if _ONE_BONE.search(stem):
+    if _ONE_BONE.fullmatch(stem) and not _SEVERAL.search(stem):
         return "bone_mask"
     if _LABELS.search(stem):
         return "mesh_labels" if _TO_MESH.search(stem) else "labels"

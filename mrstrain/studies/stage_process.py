@@ -33,19 +33,19 @@ def run_stage(
 
     ``function`` is one of `mrstrain.studies.stages`. With ``alone``, it uses one core.
     """
-    with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
-        news = Path(folder) / "news"
+    threads = usable_cores() if function == "compare" and not alone else 1  # the last stage has all cores to itself
+    try:
+        with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder, Worker(threads) as process:
+            news = Path(folder) / "news"
 
-        def watch() -> None:
-            with suppress(OSError):  # there is none yet
-                what, _, fraction = news.read_text(encoding="utf-8").rpartition("\n")
-                tell(what, float(fraction))
+            def watch() -> None:
+                with suppress(OSError):  # there is none yet
+                    what, _, fraction = news.read_text(encoding="utf-8").rpartition("\n")
+                    tell(what, float(fraction))
 
-        with Worker(1 if function in _SOLVES else usable_cores()) as process:
-            try:
-                return process.run(f"running {name}", _child, function, dict(arguments), lock, alone, news, watch=watch)
-            except WorkerError as death:
-                return WorkerError(str(death))
+            return process.run(f"running {name}", _child, function, dict(arguments), lock, alone, news, watch=watch)
+    except Exception as error:
+        return _failure(error)
 
 
 def _child(function: str, arguments: Mapping[str, Any], lock: str, alone: bool, news: Path) -> Outcome:
@@ -70,10 +70,13 @@ def outcome_of(function: str, arguments: Mapping[str, Any], lock: str, tell: Tel
     try:
         with FileLock(lock), on_one_core() if alone else nullcontext():
             return stage(tell, **arguments)
-    except WorkerError as death:
-        return WorkerError(str(death))
-    except MrstrainError as error:
-        return str(error)
     except Exception as error:
-        lack = lack_of_machine(error)
-        return WorkerError(lack) if is_lack_of_memory(error) else lack or _A_FAULT + traceback.format_exc()
+        return _failure(error)
+
+
+def _failure(error: Exception) -> WorkerError | str:
+    """How a process died, or what a stage that failed tells."""
+    if isinstance(error, MrstrainError):
+        return WorkerError(str(error)) if isinstance(error, WorkerError) else str(error)
+    lack = lack_of_machine(error)
+    return WorkerError(lack) if is_lack_of_memory(error) else lack or _A_FAULT + traceback.format_exc()

@@ -412,3 +412,27 @@ def test_how_much_is_done_is_told_from_the_first_touch_on() -> None:
 def test_a_plate_needs_a_surface_that_is_free() -> None:
     with pytest.raises(InputError, match="All nodes of 'skin' are fixed"):
         press(dome(), PRESS, fixed=("bone", "skin"))
+
+
+def test_a_shear_force_beyond_the_largest_leaves_the_state_before_it() -> None:
+    """A plate that is displaced passes the largest force that the tissue carries, and would end far beyond it."""
+    soft = {region: Ogden.from_ansys(0.0034, 0.3) for region in LAWS}
+    before, beyond = press(dome((3, 5, 5)), [LoadStep("pressed", 1.0), LoadStep("beyond", 1.0, 2.5)], soft)
+    assert before.reached == 1.0
+    assert 0.03 < beyond.reached < 1.0
+    forces = [plate.force_n[1] for plate in beyond.curve]
+    assert forces == sorted(forces)
+
+
+@pytest.mark.parametrize(
+    "loads",
+    [
+        [LoadStep("once", 1.0), LoadStep("again", 1.0)],
+        [LoadStep("sheared", 2.0, 2.0), LoadStep("less", 2.0, 0.5)],
+        [LoadStep("left", 2.0, -1.0), LoadStep("more", 2.0, -2.0)],
+    ],
+)
+def test_loads_without_more_shear_are_reached_too(loads: list[LoadStep]) -> None:
+    for state in press(dome((3, 5, 5)), loads):
+        assert state.reached == 1.0
+        assert state.force_n == pytest.approx([state.load.normal_n, state.load.shear_n or 0.0, 0.0], abs=4e-3)
