@@ -22,6 +22,7 @@ from mrstrain.studies.stages import StageResult, Tell
 Outcome = StageResult | WorkerError | str
 """The result of a stage; how a process of it died; or why it failed."""
 _SOLVES = ("simulate", "vary", "drive")  # stages that do nothing but compute on one thread
+_WITHOUT_OTHERS = ("label", "compare")  # the first and the last stage of a study, which have all cores to themselves
 _TELL_EVERY_S = 1.0
 _A_FAULT = "This is an error in mrstrain; please report it:\n"
 
@@ -33,7 +34,7 @@ def run_stage(
 
     ``function`` is one of `mrstrain.studies.stages`. With ``alone``, it uses one core.
     """
-    threads = usable_cores() if function == "compare" and not alone else 1  # the last stage has all cores to itself
+    threads = usable_cores() if function in _WITHOUT_OTHERS and not alone else 1
     try:
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder, Worker(threads) as process:
             news = Path(folder) / "news"

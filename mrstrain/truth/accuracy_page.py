@@ -138,13 +138,17 @@ def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tu
         yield [r for r in rows if r.condition == condition], [f for f in floors if f.condition == condition]
 
 
+def motion_of(row: ErrorRow) -> str:
+    """The motion of errors, with the voxels by which bones and skin were too large in the label maps."""
+    return row.motion + (f", labels {row.labels_off:+d}" if row.labels_off else "")
+
+
 def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], pictures: Sequence[Picture]) -> Section:
     head = ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95")
     values = attrgetter(
         "tissue", "true_p50", "true_p95", "shear_bias", "shear_sd", "shear_rmse", "shear_p95", "u_rmse_mm", "u_p95_mm"
     )
-    labels = {off: f", labels {off:+d}" if off else "" for off in {r.labels_off for r in errors}}
-    rows = tuple((r.motion + labels[r.labels_off], *map(_told, values(r))) for r in errors if r.by == "all")
+    rows = tuple((motion_of(r), *map(_told, values(r))) for r in errors if r.by == "all")
     tables = [Table("Error by motion and tissue", head, rows, _OF_ERRORS)]
     if floors:
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")

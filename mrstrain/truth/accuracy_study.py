@@ -11,7 +11,7 @@ from dvc.atomic_files import whole_folder, write_csv, write_json
 from dvc.io.result_folder import FIGURES, PROVENANCE, REPORT
 from dvc.report.page import record_lines, write_report
 from mrstrain.records.provenance import provenance
-from mrstrain.truth.accuracy_page import HOW_TO_READ, sections_of
+from mrstrain.truth.accuracy_page import HOW_TO_READ, motion_of, sections_of
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow
 
 
@@ -80,7 +80,7 @@ class AccuracyStudy:
     def summary(self) -> list[str]:
         """Summary, a few lines."""
         lines = [
-            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {r.motion}, {r.tissue}: max. shear RMSE "
+            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {motion_of(r)}, {r.tissue}: max. shear RMSE "
             f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"
             for r in self.errors
             if r.by == "all" and r.tissue == "fat"
