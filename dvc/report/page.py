@@ -248,7 +248,10 @@ def _small(png: bytes) -> str:
 
 def _webp(pixels: Pixels.Image, **how: Any) -> bytes:
     file = io.BytesIO()
-    pixels.save(file, "WEBP", method=4, **how)
+    try:
+        pixels.save(file, "WEBP", method=4, **how)
+    except (KeyError, ValueError) as failure:  # the encoder was not loaded, or failed: for want of memory
+        raise MemoryError(f"A picture could not be encoded ({failure}).") from failure
     return file.getvalue()
 
 

@@ -7,8 +7,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from dvc.images.depth import to_surface_mm
-from dvc.images.image import Grid
+from dvc.images.image import Grid, Image, Mask
 from dvc.measurement import error_bars
+from dvc.measurement.subject import Subject
+from dvc.trust.error_model import POOLED
 
 GRID = Grid((40, 36, 30), (0.8, 0.8, 1.6), (0.0, 0.0, 0.0))
 
@@ -32,3 +34,12 @@ def test_distances_to_bone_are_computed_in_the_box_of_the_body_alone(seed, monke
         assert inside.sum() > 500
         np.testing.assert_array_equal(found[inside], whole[inside])
     assert sum(sizes) < 0.4 * near.size
+
+
+@pytest.mark.parametrize("with_bone", [False, True])
+def test_tissue_without_labels_has_the_name_that_its_intervals_have(with_bone):
+    """Tables of strain look intervals up by it."""
+    body = np.ones(GRID.shape, dtype=bool)
+    bone = Mask(GRID, np.arange(GRID.shape[0])[:, None, None] < 5 * body) if with_bone else None
+    regions = Subject(Image(GRID, body.astype(np.float32)), bone).regions(Mask(GRID, body))
+    assert regions.names == {1: POOLED} | ({2: "bone"} if with_bone else {})

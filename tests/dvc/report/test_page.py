@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter
 
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, LabelMap
+from dvc.report import page
 from dvc.report.alike import alike
 from dvc.report.chart import chart
 from dvc.report.drawing import png_bytes
@@ -364,3 +365,15 @@ def test_a_picture_fades_to_those_beneath_it(tmp_path: Path) -> None:
         ("Load1, Strain: c.", "over", None), ("Load1, Curves: c.", None, None),
     ]  # fmt: skip
     assert [(a["type"], a["value"]) for a in page.all("input")] == [("range", "0"), ("range", "100")]
+
+
+@pytest.mark.parametrize("failure", [KeyError("WEBP"), ValueError("encoding error 1")])
+def test_an_encoder_without_memory_is_a_lack_of_memory(failure, monkeypatch) -> None:
+    """Pillow tells of it like this, and a command ended in a traceback."""
+
+    def failing(*_: object, **__: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(Pixels.Image, "save", failing)
+    with pytest.raises(MemoryError, match="could not be encoded"):
+        page._webp(Pixels.new("RGB", (2, 2)))

@@ -115,9 +115,9 @@ def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, alone):
 
 @pytest.mark.full_size
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
-@pytest.mark.parametrize(("mib", "ends"), [(800, 2), (1120, 1)])
+@pytest.mark.parametrize(("mib", "ends"), [(800, 2), (1120, 2), (1300, 0)])
 def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, ends):
-    """Address space for the command itself is lacking, then for the libraries of its stages.
+    """Address space is lacking for the command, then for its report and some stages, then for none.
 
     Dask and loky may print tracebacks of their own where they get no thread; none comes from mrstrain.
     """
@@ -129,15 +129,12 @@ def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, 
     )  # fmt: skip
     said = told.stdout + told.stderr
     assert told.returncode == ends
+    if not ends:
+        return
     assert "The memory ran out" in said
     assert "fewer --workers" in said.replace("\n", " ")
     assert "error in mrstrain" not in said
     assert not re.search(rf'File "{re.escape(str(ROOT))}/(?:dvc|fe|mrstrain|phantoms|validate)/', said), said
-    if ends == 1:
-        log = (tmp_path / "study" / "results" / "study.log").read_text()
-        assert re.search(
-            r"mesh: FAILED .* The memory ran out .* tried once more, alone; by the estimate it needs 1\.5 GiB", log
-        )
 
 
 class Machine:
