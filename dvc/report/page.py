@@ -35,6 +35,8 @@ _TONES: Mapping[Level | None, tuple[str, str]] = {
 _GREYS, _COLOURS = 24, 80  # steps of a volume's values: each takes room, of noise above all; a strain to .007 of .55
 _BLACK = 2.5  # steps of an image: below, it is air
 _QUALITY = 58  # of pictures on the page; files of figures lose nothing
+# Pillow's errors where memory runs out: the encoder could not be loaded, or got none (VP8_ENC_ERROR_OUT_OF_MEMORY).
+_NO_MEMORY = "'WEBP'", "encoding error 1"
 _WHITE, _CHART_COLOURS = 0.5, 128  # a chart: so much of it is white, and so many colours are enough
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"
@@ -250,7 +252,9 @@ def _webp(pixels: Pixels.Image, **how: Any) -> bytes:
     file = io.BytesIO()
     try:
         pixels.save(file, "WEBP", method=4, **how)
-    except (KeyError, ValueError) as failure:  # the encoder was not loaded, or failed: for want of memory
+    except (KeyError, ValueError) as failure:
+        if str(failure) not in _NO_MEMORY:
+            raise
         raise MemoryError(f"A picture could not be encoded ({failure}).") from failure
     return file.getvalue()
 

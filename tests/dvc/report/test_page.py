@@ -377,3 +377,8 @@ def test_an_encoder_without_memory_is_a_lack_of_memory(failure, monkeypatch) -> 
     monkeypatch.setattr(Pixels.Image, "save", failing)
     with pytest.raises(MemoryError, match="could not be encoded"):
         page._webp(Pixels.new("RGB", (2, 2)))
+
+
+def test_a_picture_that_is_too_large_is_no_lack_of_memory() -> None:
+    with pytest.raises(ValueError, match="encoding error 5"):  # a WebP image has at most 16383 pixels along an edge
+        page._webp(Pixels.new("RGB", (20_000, 1)))
