@@ -83,7 +83,8 @@ def in_this_process() -> Iterator[None]:
 class Worker(AbstractContextManager["Worker", None]):
     """One child process that runs one task at a time; if it dies, that task fails and the next gets a fresh process.
 
-    So it is after an interrupt, too, which ends the process with its task.
+    So it is after an interrupt, too, which ends the process with its task. A process that dies between tasks is
+    replaced, and no task fails.
 
     Native code (ITK, numba, BLAS) may use ``threads`` threads in it: results of elastix are equal bit for bit only for
     equal numbers. It is kept alive between tasks, because the first use of elastix costs many seconds.
@@ -175,6 +176,8 @@ class Worker(AbstractContextManager["Worker", None]):
         """The child process, started where there is none."""
         if self._killed:
             raise WorkerError("The process was ended before its task began. Run the command again.")
+        if self._executor is not None and self._executor._flags.broken is not None:  # it died between tasks
+            self._abandon(self._executor)
         if self._executor is None:
             count = str(self.threads)
             names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")

@@ -218,6 +218,14 @@ def test_death_is_an_error_that_says_so_and_the_next_task_runs(task, signal_name
     assert process != os.getpid()
 
 
+def test_a_process_that_is_killed_between_tasks_fails_none():
+    with Worker(threads=1) as worker:
+        first, _ = worker.run("asking", _process)
+        os.kill(first, signal.SIGKILL)
+        wait_for(lambda: worker._executor._flags.broken)
+        assert worker.run("asking", _process)[0] != first
+
+
 def test_its_own_errors_come_back_as_they_are():
     with Worker(threads=1) as worker, pytest.raises(RegistrationError, match="no overlap"):
         worker.run("registering", _fails)
