@@ -135,11 +135,12 @@ def _statement(where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, 
             f"({one.low_ml:.2f} to {one.high_ml:.2f}). It is {nothing.best_ml:.2f} mL for a model without deformation."
             + caveat
         )
-    best, *others = (a.model for a in ranked)
+    first, (best, *others) = ranked[0], (a.model for a in ranked)
     near = [b for a, b in pairs if a == best]
     neighbours = [f"{a} and {b}" for a, b in pairwise(others) if (a, b) in pairs]
     return (
-        f"Best match {where} (area metric): {best}"
+        f"Best match {where} (area metric): {best}, {first.best_ml:.2f} mL (95 % interval {first.low_ml:.2f} to "
+        f"{first.high_ml:.2f}; {nothing.best_ml:.2f} mL without deformation)"
         + (f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other.")
         + " It is no better than a model without deformation." * (best in no_nearer(ranked, nothing))
         + (f" Among the other models, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")

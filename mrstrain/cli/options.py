@@ -85,7 +85,17 @@ def tell(done: Done) -> None:
 
 
 class Grouped(TyperCommand):
-    """A command whose help lists its options in groups."""
+    """A command whose help lists its options in groups, and which says what a missing argument is."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line; an error on a missing argument or option includes its help."""
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as missing:
+            if type(missing).__name__ == "MissingParameter":  # of click, or of the copy that typer has
+                told: Any = missing
+                told.message = told.param.help
+            raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The words after the command, arguments without the braces that typer puts around them."""

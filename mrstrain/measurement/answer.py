@@ -25,7 +25,19 @@ def measured_strain(
     picture = measured_by_load(subject, folders).save(out / FIGURE)
     table = table_of_loads(measured)
     tables = () if table is None else (table,)
-    return [Section("Measured strain", None, tables, (picture,), pictures_first=True)]
+    return [Section("Measured strain", None, tables, (picture,), most_strained(table), pictures_first=True)]
+
+
+def most_strained(table: Table | None) -> tuple[str, ...]:
+    """A sentence on the row of a table of `table_of_loads` with the largest 95th percentile; none without a table."""
+    known = [row for row in table.rows if str(row[3])[0].isdigit()] if table is not None else []  # a dash without it
+    if not known:
+        return ()
+    load, tissue, median, high, *_ = max(known, key=lambda row: float(str(row[3]).split()[0]))
+    return (
+        f"The measured maximum shear strain is largest in {tissue} under {load}: median {median}, "
+        f"95th percentile {high}.",
+    )
 
 
 def table_of_loads(measured: Sequence[Section]) -> Table | None:

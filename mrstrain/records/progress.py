@@ -54,7 +54,7 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
         else:
             yield partial(shown, _lines_of_all() if of_all else _lines())
     except KeyboardInterrupt:
-        console.print("Interrupted. Finished results are kept.")
+        console.print("Interrupted. Finished results are kept." + " The same command resumes." * of_all)
         raise
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dvc.errors import InputError
 from dvc.report.page import Picture, Section
-from mrstrain.measurement.answer import table_of_loads
+from mrstrain.measurement.answer import most_strained, table_of_loads
 from validate import NOTHING, Comparison
 
 _NEAREST = (
@@ -21,20 +21,22 @@ def answer_of(
 ) -> list[Section]:
     """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
 
-    Its table has a row for each load and tissue: the measured maximum shear strain, and the best match. Without a
-    comparison it has ``pictures`` of the measured strain.
+    It begins with the most strained tissue. Its table has a row for each load and tissue: the measured maximum shear
+    strain, and the best match. Without a comparison it has ``pictures`` of the measured strain.
     """
     table = table_of_loads(measured)
     if not compared:
-        first = Section("Measured strain", pictures=tuple(pictures), pictures_first=True)
-        return [] if table is None else [replace(first, tables=(table,))]
+        if table is None:
+            return []
+        return [Section("Measured strain", None, (table,), tuple(pictures), most_strained(table), pictures_first=True)]
     if table is None:
         return list(compared)
     nearest = _nearest(folder)
     rows = tuple((*row, nearest.get((str(row[0]), str(row[1])), "–")) for row in table.rows)
     columns = (*table.columns, "best match")
     first_table = replace(table, columns=columns, rows=rows, note=table.note + _NEAREST)
-    return [replace(compared[0], tables=(first_table, *compared[0].tables))]
+    words = (*most_strained(table), *compared[0].paragraphs)
+    return [replace(compared[0], tables=(first_table, *compared[0].tables), paragraphs=words)]
 
 
 def _nearest(folder: Path) -> dict[tuple[str, str], str]:

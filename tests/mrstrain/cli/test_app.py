@@ -31,6 +31,19 @@ def test_a_command_does_not_greet_and_one_that_there_is_not_is_refused() -> None
     assert CliRunner().invoke(app, ["registr"]).exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["Load0.nii.gz"], "Missing argument 'loads'. Loaded images."),
+        (["Load0.nii.gz", "Load1.nii.gz"], "Missing option '--out'. Folder for the results; created if missing."),
+    ],
+)
+def test_what_is_missing_is_told_with_what_it_is(given: list[str], told: str) -> None:
+    ran = CliRunner().invoke(app, ["register", *given])
+    assert ran.exit_code == 2
+    assert told in ran.output
+
+
 @pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"doctor"}))  # which takes nothing
 def test_each_help_ends_with_an_example_that_can_be_pasted(name: str) -> None:
     program, command, *given = HELP[name].splitlines()[-1].split()

@@ -136,3 +136,10 @@ def test_thirty_ended_stages_do_not_push_the_running_one_off_the_screen() -> Non
     assert "25 %" in shown[1]
     for number in range(30):  # above the bars, once each
         assert file.getvalue().count(f"simulate set-{number}: plate displacement [{number}] mm") == 1
+
+
+@pytest.mark.parametrize(("of_all", "end"), [(False, "kept."), (True, "kept. The same command resumes.")])
+def test_an_interrupt_is_told_with_how_to_go_on(of_all: bool, end: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(KeyboardInterrupt), progress.live(of_all=of_all):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err.splitlines() == [f"Interrupted. Finished results are {end}"]

@@ -12,6 +12,7 @@ from dvc.measurement.page import summary_table
 from dvc.report.page import Section, Table
 from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
+from mrstrain.measurement.answer import most_strained
 from mrstrain.studies.answer import answer_of
 from tests.validate.test_comparison import case, cube, labels, result, sheared
 from validate import NOTHING, Area, Comparison, Criteria, compare
@@ -41,6 +42,10 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
     (first,) = answer_of([section("Load1"), section("Load2"), Section("Load3")], [overview], folder)
     table, area = first.tables
     assert (first.title, area.title) == ("Models and loads", "Area")
+    assert first.paragraphs == (
+        "The measured maximum shear strain is largest in fat under Load1: median 0.131 (0.030 to 0.139), "
+        "95th percentile 0.420.",
+    )
     assert table.columns == ("load", "tissue", "median", "95th percentile", "best match")
     assert table.rows == (
         ("Load1", "fat", "0.131 (0.030 to 0.139)", "0.420", "near"),
@@ -62,6 +67,18 @@ def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_have
     monkeypatch.setattr("mrstrain.studies.answer.Comparison", SimpleNamespace(read=lambda _: known))
     (first,) = answer_of([section("Load1"), section("Load2")], [Section("Models and loads")], tmp_path)
     assert [row[-1] for row in first.tables[0].rows] == ["best (second)", "–"]
+
+
+def test_the_most_strained_tissue_is_that_of_the_largest_95th_percentile() -> None:
+    rows = (
+        ("Load1", "fat", "0.3 (0.2 to 0.4)", "0.419 (0.4 to 0.5)"),
+        ("Load2", "skin", "0.1", "0.42"),
+        ("Load2", "tendon", "–", "–"),
+    )
+    (sentence,) = most_strained(Table("Measured", ("load", "tissue", "median", "95th percentile"), rows))
+    assert sentence.endswith("is largest in skin under Load2: median 0.1, 95th percentile 0.42.")
+    assert most_strained(Table("Measured", ("load", "tissue", "median", "95th percentile"), rows[2:])) == ()
+    assert most_strained(None) == ()
 
 
 def test_intervals_are_told_of_only_where_there_are_any(tmp_path: Path) -> None:
