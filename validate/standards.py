@@ -86,7 +86,7 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
     best, nothing = rows[names[0]], rows[NOTHING]
     return (
         f"In {tissue}, the probability of representation is {100.0 * best.probability:.0f} % for {best.model} and "
-        f"{100.0 * nothing.probability:.0f} % for no deformation. It is weighted by the size of the errors: "
+        f"{100.0 * nothing.probability:.0f} % for no deformation. Each coefficient counts by the size of its error: "
         f"{best.in_band} of the {best.coefficients} coefficients of {best.model} lie within their uncertainty.",
         _accepted(best),
         f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "

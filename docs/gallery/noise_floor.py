@@ -1,4 +1,4 @@
-"""The noise floor: what a registration finds where there is no strain."""
+"""The noise floor: the apparent strain between two unloaded images."""
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -1,6 +1,5 @@
 """What a measurement is made from, how a registration is judged, and what is written of it beside the maps."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -103,15 +102,17 @@ def carried_images(found: Registration) -> CarriedImages:
 
 
 def quality_of(
-    found: Registration, maps: StrainMaps, similarity: Similarity, evidence: Evidence, doubts: Sequence[str] = ()
+    found: Registration, maps: StrainMaps, similarity: Similarity, evidence: Evidence, subject: Subject
 ) -> Quality:
-    """Quality and verdict of a registration; with ``doubts`` about what it was made from, "Use with care" at best."""
+    """Quality and verdict of a registration; with doubts about the subject's labels, "Use with care" at best."""
     points, floor, choice = evidence.landmarks, evidence.noise_floor, found.choice
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if points is None else target_registration_error(found.total, *points)
     quality = assess(
-        maps, found.tissue, bone, similarity=similarity, landmark_errors_mm=errors, floor=floor, in_bone=choice.in_bone
-    )
+        maps, found.tissue, bone, similarity=similarity, landmark_errors_mm=errors, floor=floor, in_bone=choice.in_bone,
+        plate_axes=subject.axes,
+    )  # fmt: skip
+    doubts = () if subject.from_image is None else subject.from_image.doubts
     every = [*([found.bone_doubt] if found.bone_doubt else []), *doubts]
     cautions = [Verdict("caution", (doubt,)) for doubt in every]
     return replace(quality, verdict=with_caution(together([quality.verdict, *cautions]), choice))

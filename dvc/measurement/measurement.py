@@ -122,8 +122,7 @@ class Measurement:
             images = carried.result()
         if is_repeat:
             more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
-        doubts = () if subject.from_image is None else subject.from_image.doubts
-        quality = judgement.quality_of(found, maps, images.similarity, more, doubts)
+        quality = judgement.quality_of(found, maps, images.similarity, more, subject)
         alignment = judgement.alignment_of(found)
         regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
         source, at = Source(subject, found.tissue, found, images), subject.lowest_bone_point_mm
@@ -148,7 +147,8 @@ class Measurement:
         (relative, motion), body = without_motion(whole, subject.bone), subject.body()
         maps = strain_maps(relative, body)
         alignment = {"on": "none" if subject.bone is None else "bone", **judgement.motion_as_dict(motion)}
-        quality, bars, source = assess(maps, body, subject.bone), ErrorBars(None, ""), Source(subject, body)
+        quality = assess(maps, body, subject.bone, plate_axes=subject.axes)
+        bars, source = ErrorBars(None, ""), Source(subject, body)
         regions, at = tuple(region_statistics(subject.regions(body), maps.by_quantity)), subject.lowest_bone_point_mm
         return cls(name, relative, maps, alignment, quality, regions, bars, subject.reference, source, at)
 

@@ -8,6 +8,7 @@ import numpy as np
 from dvc.arrays import Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Mask
+from dvc.trust.plate_motion import displacement_along_normal, moves_away
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
 
@@ -73,6 +74,7 @@ def assess(
     landmark_errors_mm: FloatArray | None = None,
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
+    plate_axes: FloatArray | None = None,
 ) -> Quality:
     """Assess a registration by its strain maps, the similarity of the images, and further evidence.
 
@@ -94,6 +96,9 @@ def assess(
     in_bone : (mm, no unit), optional
         For maps with a rigid bone: root mean square displacement and 95th percentile of the maximum shear strain in the
         bone before it was made rigid.
+    plate_axes : (3, 3), optional
+        Of a plate that presses on the tissue, LPS (`dvc.plate_axes`): the tissue between it and the bone must move
+        towards the bone.
 
     Returns
     -------
@@ -136,6 +141,8 @@ def assess(
     findings += _judged("landmark_error_mm", quality.landmarks["median_mm"])
     if floor is not None:
         findings += _judged("floor_shear_p95", floor.max_shear_p95)
+    if bone is not None and plate_axes is not None:
+        findings += moves_away(displacement_along_normal(maps, tissue, bone, plate_axes))
     return replace(quality, verdict=together(findings))
 
 

@@ -1,0 +1,63 @@
+"""Does the tissue between the bone and the plate move as under a plate: towards the bone?"""
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.deformation.strain_maps import StrainMaps
+from dvc.images.image import Mask
+from dvc.trust.verdict import Verdict
+
+_CELL_MM, _LAYER_MM = 3.0, 3.0
+_MOST_MM = 0.5
+
+
+def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, axes: FloatArray) -> float:
+    """Mean displacement along the plate's outward normal of the tissue nearest the plate, in the shadow of the bone.
+
+    Parameters
+    ----------
+    maps : StrainMaps
+        Displacement relative to the bone, reference configuration, LPS mm.
+    tissue, bone : Mask
+        On the grid of the maps. Only tissue within 3 mm of its outer surface counts, where the bone lies behind it.
+    axes : (3, 3)
+        Columns: plate normal, away from the body, and two directions in the plate, LPS; see `dvc.plate_axes`.
+
+    Returns
+    -------
+    float
+        mm; negative where the tissue is compressed against the bone, NaN if there is no such tissue.
+    """
+    spacing = maps.grid.spacing_mm
+    sparse = tuple(slice(None, None, max(1, int(2.0 / step))) for step in spacing)
+    cell_mm = max(_CELL_MM, 1.5 * float(spacing.max()))
+    chosen = np.zeros(maps.grid.shape, dtype=bool)
+    chosen[sparse] = (tissue.inside & maps.valid & ~bone.inside)[sparse]
+    of_bone, of_tissue = bone.points() @ axes, maps.grid.points(chosen) @ axes
+    along = maps.displacement_mm[chosen].astype(np.float64) @ axes[:, 0]
+    if not (of_bone.size and of_tissue.size):
+        return float("nan")
+    lowest = of_bone[:, 1:].min(axis=0)
+    cells = np.floor((of_bone[:, 1:] - lowest) / cell_mm).astype(int)
+    end_of_bone = np.full(cells.max(axis=0) + 1, -np.inf)
+    np.maximum.at(end_of_bone, tuple(cells.T), of_bone[:, 0])
+    cells = np.floor((of_tissue[:, 1:] - lowest) / cell_mm).astype(int)
+    behind = ((cells >= 0) & (cells < end_of_bone.shape)).all(axis=1)
+    height, along, cells = of_tissue[behind, 0], along[behind], tuple(cells[behind].T)
+    between = np.isfinite(end_of_bone[cells]) & (height > end_of_bone[cells])
+    surface = np.full(end_of_bone.shape, -np.inf)
+    np.maximum.at(surface, tuple(of[between] for of in cells), height[between])
+    outer = between & (height > surface[cells] - _LAYER_MM)
+    return float(along[outer].mean()) if outer.any() else float("nan")
+
+
+def moves_away(displacement_mm: float) -> list[Verdict]:
+    """A finding where the tissue under the bone moves towards the plate; none otherwise, or for NaN."""
+    if not displacement_mm > _MOST_MM:
+        return []
+    told = (
+        f"Tissue under the bone moves away from it, by {displacement_mm:.1f} mm on average along the plate normal "
+        f"(use with care above {_MOST_MM:g} mm); a plate presses it towards the bone. Check that the unloaded and the "
+        "loaded image are not swapped, and that plate_normal points away from the body."
+    )
+    return [Verdict("caution", (told,))]
