@@ -336,7 +336,7 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] =
         return None
     distrust, caution = ([r for v in verdicts if v.level == level for r in v.reasons] for level in LEVELS[:0:-1])
     registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
-    sound = f"{registrations} can be trusted. This is no verdict on the models, which are compared below."
+    sound = f"{registrations} passed all checks. This is a verdict on the measurement; the models are judged below."
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 

@@ -27,7 +27,8 @@ from validate.mapping import ALL, MappedFields, map_fields
 from validate.mavm import ModelForm, model_form
 from validate.sensitivity import Sensitivity, changes_of
 
-_STRAINED = 0.01
+STRAINED = 0.01
+"""Least fraction of a tissue that must be measured above the lower end of the range for an informative area."""
 
 NOTHING = "no deformation"
 """Name of a model that predicts zero strain everywhere: the reference for areas, outside the ranking."""
@@ -188,7 +189,7 @@ class LoadComparison:
         where = self.fields.common
         volumes = self.fields.volumes_ml[where]
         above = volumes[self.fields.measured.max_shear[where] > self.criteria.strains[0]].sum()
-        return bool(above < _STRAINED * volumes.sum())
+        return bool(above < STRAINED * volumes.sum())
 
     def ranked(self) -> list[Area]:
         """Areas of the ranked models in all soft tissue, smallest first, by the estimate if there is one.

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 from scipy.special import stdtrit
@@ -75,12 +75,13 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     informative = None if ALL_LOADS in uninformative else band
     pairs = {ALL_LOADS: _pairs(ranked, informative)}
     pairs |= {one.load: _pairs(one.ranked(), None if one.hardly_strained else one.bands.get(ALL)) for one in loads}
-    statements = [_under(one, pairs[one.load]) for one in loads]
-    if len(loads) > 1 and everywhere and informative is not None:
+    many = len(loads) > 1 and bool(everywhere) and informative is not None
+    statements = [_under(one, pairs[one.load], many) for one in sorted(loads, key=lambda one: one.hardly_strained)]
+    if many:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
         caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
         caveat *= bool(distrusted)
-        statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat))
+        statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat, brief=False))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs, tuple(uninformative))
 
 
@@ -114,38 +115,38 @@ def _pairs(ranked: Sequence[Area], band: Band | None) -> Pairs:
     return tuple((a, b) for a, b in pairs if band is None or not (band.surely_below(a, b) or band.surely_below(b, a)))
 
 
-def _under(one: LoadComparison, pairs: Pairs) -> str:
+def _under(one: LoadComparison, pairs: Pairs, brief: bool) -> str:
     """The statement on one load; empty if the uncertainty is unknown."""
     if one.hardly_strained:
         low = one.criteria.strains[0]
-        return f"{one.load}: less than 1 % of the tissue exceeds {low:g}, so the area metric is not informative."
+        few = f"the measured maximum shear strain exceeds {low:g} in less than 1 % of the tissue"
+        return f"{one.load}: {few}, so the area metric is not informative."
     distrusted = bool(one.case.verdict and one.case.verdict.level == "distrust")
     caveat = " The registration of this load has the verdict Do not trust." * distrusted
-    return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat) if ALL in one.bands else ""
+    known = ALL in one.bands
+    return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat, brief=brief) if known else ""
 
 
-def _statement(where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str) -> str:
-    """The best model, and models not distinguishable from it or from their neighbours; of a single model, its area."""
+def _statement(
+    where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str, *, brief: bool
+) -> str:  # fmt: skip
+    """The best model, the models not distinguishable from it, and its area; of a single model, its area.
+
+    A ``brief`` one follows one that says between which curves the area is.
+    """
     if not ranked:
         return ""
+    best = ranked[0]
+    area = f"{best.best_ml:.2f} mL (95 % interval {best.low_ml:.2f} to {best.high_ml:.2f})"
+    scale = f"a perfect model has 0 mL, one without deformation {nothing.best_ml:.2f} mL."
     if len(ranked) == 1:
-        (one,) = ranked
-        return (
-            f"Area between the strain-volume curves of {one.model} and the measurement {where}: {one.best_ml:.2f} mL "
-            f"({one.low_ml:.2f} to {one.high_ml:.2f}). It is {nothing.best_ml:.2f} mL for a model without deformation."
-            + caveat
-        )
-    first, (best, *others) = ranked[0], (a.model for a in ranked)
-    near = [b for a, b in pairs if a == best]
-    neighbours = [f"{a} and {b}" for a, b in pairwise(others) if (a, b) in pairs]
-    return (
-        f"Best match {where} (area metric): {best}, {first.best_ml:.2f} mL (95 % interval {first.low_ml:.2f} to "
-        f"{first.high_ml:.2f}; {nothing.best_ml:.2f} mL without deformation)"
-        + (f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other.")
-        + " It is no better than a model without deformation." * (best in no_nearer(ranked, nothing))
-        + (f" Among the other models, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")
-        + caveat
-    )
+        between = f"Area between the strain-volume curves of {best.model} and the measurement {where}"
+        return f"{between}: {area}; {scale}{caveat}"
+    near = [b for a, b in pairs if a == best.model]
+    of_all = f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other."
+    between = "Area" if brief else "Area between its strain-volume curve and the measured one"
+    worse = " It is no better than a model without deformation." * (best.model in no_nearer(ranked, nothing))
+    return f"Best match {where} (area metric): {best.model}{of_all} {between}: {area}; {scale}{worse}{caveat}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,14 +1,40 @@
 """The first part of a report on measurements: the strain of every load in one slice, and by tissue in a table."""
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from dvc import Subject
+from dvc.errors import InputError
+from dvc.io.result_folder import QUALITY
 from dvc.measurement.subject import is_bones_name
 from dvc.report.page import Section, Table
+from dvc.trust.quality import NoiseFloor, read_noise_floor
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
 _INTERVALS = ", with the interval of 95 % coverage in brackets"
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredBeside:
+    """What is known beside the strain: the forces of each load in words, and the noise floor of a repeat scan."""
+
+    forces: Mapping[str, str] = field(default_factory=dict)
+    floor: NoiseFloor | None = None
+
+    @classmethod
+    def of(cls, folders: Mapping[str, Path], forces: Mapping[str, str] | None = None) -> "MeasuredBeside":
+        """With the noise floor that the loads' results were judged by, which is the same in all ``folders``."""
+        for folder in folders.values():
+            try:
+                return cls(forces or {}, read_noise_floor(folder / QUALITY))
+            except InputError:
+                continue
+        return cls(forces or {})
+
+
+NOTHING_BESIDE = MeasuredBeside()
 
 
 def measured_strain(
@@ -25,19 +51,33 @@ def measured_strain(
     picture = measured_by_load(subject, folders).save(out / FIGURE)
     table = table_of_loads(measured)
     tables = () if table is None else (table,)
-    return [Section("Measured strain", None, tables, (picture,), most_strained(table), pictures_first=True)]
+    words = most_strained(table, MeasuredBeside.of(folders))
+    return [Section("Measured strain", None, tables, (picture,), words, pictures_first=True)]
 
 
-def most_strained(table: Table | None) -> tuple[str, ...]:
-    """A sentence on the row of a table of `table_of_loads` with the largest 95th percentile; none without a table."""
-    known = [row for row in table.rows if str(row[3])[0].isdigit()] if table is not None else []  # a dash without it
+def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) -> tuple[str, ...]:
+    """A sentence on the most strained tissue of a table of `table_of_loads`; none without a table.
+
+    It is the one with the largest 95th percentile, by the lower end of the interval where there is one: a tissue of few
+    voxels may have a larger percentile by chance.
+    """
+    known = [row for row in table.rows if _at_least(row[3]) is not None] if table is not None else []
     if not known:
         return ()
-    load, tissue, median, high, *_ = max(known, key=lambda row: float(str(row[3]).split()[0]))
-    return (
-        f"The measured maximum shear strain is largest in {tissue} under {load}: median {median}, "
-        f"95th percentile {high}.",
-    )
+    load, tissue, median, high, *_ = max(known, key=lambda row: _at_least(row[3]) or 0.0)
+    force = f" ({beside.forces[str(load)]})" if str(load) in beside.forces else ""
+    told = f"The most strained tissue is {tissue} under {load}{force}: measured maximum shear strain {median} in the "
+    told += f"median and {high} at the 95th percentile"
+    told += ", with 95 % intervals in brackets." if "(" in str(high) else "."
+    if beside.floor is not None:
+        told += f" The noise floor is {beside.floor.max_shear_p50:.3f} and {beside.floor.max_shear_p95:.3f}."
+    return (told,)
+
+
+def _at_least(cell: object) -> float | None:
+    """Lower end of the interval in a cell of `table_of_loads`, or the value without an interval; None for a dash."""
+    numbers = [float(number) for number in re.findall(r"\d+\.?\d*", str(cell))]
+    return numbers[:2][-1] if numbers else None
 
 
 def table_of_loads(measured: Sequence[Section]) -> Table | None:

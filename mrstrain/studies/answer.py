@@ -1,60 +1,73 @@
 """The first part of the report of a study: the best-matching model, and the measured strain."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from dvc.errors import InputError
 from dvc.report.page import Picture, Section
-from mrstrain.measurement.answer import most_strained, table_of_loads
+from mrstrain.measurement.answer import NOTHING_BESIDE, MeasuredBeside, most_strained, table_of_loads
 from validate import NOTHING, Comparison
+from validate.load_comparison import STRAINED
 
 _NEAREST = (
-    " Best match: smallest area between the strain-volume curves of model and measurement in that tissue alone; the "
-    "sentences above judge all soft tissue together. In brackets: models whose intervals overlap with its interval. "
-    "A dash: no model is better than no deformation, or hardly any tissue is strained."
+    " Best match: the model with the smallest area between its strain-volume curve and the measured one in that tissue "
+    "alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, so another "
+    "model may be best. In brackets: models whose 95 % interval overlaps with that of the best match; no significance "
+    "test is made for a single tissue. None: no model has a smaller area than one without deformation. A dash: hardly "
+    "any of this tissue is strained (less than 1 % above {low:g}), so its areas are not informative."
 )
 
 
 def answer_of(
-    measured: Sequence[Section], compared: Sequence[Section], folder: Path, pictures: Sequence[Picture] = ()
-) -> list[Section]:
+    measured: Sequence[Section], compared: Sequence[Section], folder: Path, pictures: Sequence[Picture] = (),
+    beside: MeasuredBeside = NOTHING_BESIDE,
+) -> list[Section]:  # fmt: skip
     """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
 
     It begins with the most strained tissue. Its table has a row for each load and tissue: the measured maximum shear
     strain, and the best match. Without a comparison it has ``pictures`` of the measured strain.
     """
     table = table_of_loads(measured)
+    words = most_strained(table, beside)
     if not compared:
         if table is None:
             return []
-        return [Section("Measured strain", None, (table,), tuple(pictures), most_strained(table), pictures_first=True)]
+        return [Section("Measured strain", None, (table,), tuple(pictures), words, pictures_first=True)]
     if table is None:
         return list(compared)
-    nearest = _nearest(folder)
-    rows = tuple((*row, nearest.get((str(row[0]), str(row[1])), "–")) for row in table.rows)
-    columns = (*table.columns, "best match")
-    first_table = replace(table, columns=columns, rows=rows, note=table.note + _NEAREST)
-    words = (*most_strained(table), *compared[0].paragraphs)
-    return [replace(compared[0], tables=(first_table, *compared[0].tables), paragraphs=words)]
+    comparison = _comparison(folder)
+    if comparison is not None:
+        nearest = _nearest(comparison)
+        rows = tuple((*row, nearest.get((str(row[0]), str(row[1])), "–")) for row in table.rows)
+        note = table.note + _NEAREST.format(low=comparison.strains[0])
+        table = replace(table, columns=(*table.columns, "best match"), rows=rows, note=note)
+    paragraphs = (*words, *compared[0].paragraphs)
+    return [replace(compared[0], tables=(table, *compared[0].tables), paragraphs=paragraphs)]
 
 
-def _nearest(folder: Path) -> dict[tuple[str, str], str]:
-    """The model with the smallest area for each informative load and tissue, and those that may be as good.
-
-    None if its area is not below that of a model without deformation.
-    """
+def _comparison(folder: Path) -> Comparison | None:
     try:
-        comparison = Comparison.read(folder)
+        return Comparison.read(folder)
     except InputError:
-        return {}
-    areas = [a for a in comparison.areas if not a.levelled and a.load not in comparison.ranking.uninformative]
+        return None
+
+
+def _nearest(comparison: Comparison) -> Mapping[tuple[str, str], str]:
+    """For each load and tissue that is strained: the model with the smallest area, and those that may be as good."""
     found: dict[tuple[str, str], str] = {}
-    for key in dict.fromkeys((area.load, area.tissue) for area in areas):
-        best, *others = sorted(
-            (area for area in areas if (area.load, area.tissue) == key), key=lambda a: (a.best_ml, a.model != NOTHING)
-        )
-        if best.model != NOTHING:
-            near = [other.model for other in others if other.model != NOTHING and other.low_ml <= best.high_ml]
-            found[key] = f"{best.model} ({', '.join(near)})" if near else best.model
+    for curve in comparison.curves:
+        if curve.field != "measured" or curve.load in comparison.ranking.uninformative:
+            continue
+        above, whole = np.interp([comparison.strains[0], 0.0], curve.max_shear, curve.volume_above_ml)
+        if above < STRAINED * whole:
+            continue
+        areas = [a for a in comparison.areas if (a.load, a.tissue) == (curve.load, curve.tissue) and not a.levelled]
+        (limit,) = [a.best_ml for a in areas if a.model == NOTHING]
+        better = sorted((a for a in areas if a.best_ml < limit), key=lambda a: a.best_ml)
+        near = [other.model for other in better[1:] if other.low_ml <= better[0].high_ml]
+        best = better[0].model if better else "none"
+        found[curve.load, curve.tissue] = f"{best} ({', '.join(near)})" if near else best
     return found

@@ -107,6 +107,13 @@ class Load(_Part):
     plate_normal: Vector | None = None
     shear_direction: Vector | None = None
 
+    @property
+    def in_words(self) -> str:
+        """Forces of the plate, or its displacements; empty without any."""
+        amounts = ((self.normal_n, "N"), (self.normal_mm, "mm normal"), (self.shear_n, "N shear"),
+                   (self.shear_mm, "mm shear"))  # fmt: skip
+        return ", ".join(f"{amount:g} {unit}" for amount, unit in amounts if amount)
+
 
 class Plate(modelling.PlateOptions):
     """The plate."""
@@ -206,6 +213,11 @@ class Study(_Part):
             name: (load.plate_normal or self.plate.plate_normal, load.shear_direction or self.plate.shear_direction)
             for name, load in self.loads.items()
         }
+
+    @property
+    def forces(self) -> dict[str, str]:
+        """Forces of the plate, or its displacements, of each load that has any, in words."""
+        return {name: words for name, load in self.loads.items() if (words := load.in_words)}
 
     @property
     def makes_labels(self) -> bool:

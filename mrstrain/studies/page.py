@@ -15,6 +15,7 @@ from dvc.trust.verdict import worst
 from mrstrain.comparison.credibility import TITLE as CREDIBILITY
 from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.measurement.acquisition import ACQUIRED, acquisition_section, acquisition_sentence
+from mrstrain.measurement.answer import MeasuredBeside
 from mrstrain.options.measurement import MeshAndAxes
 from mrstrain.options.modelling import Directions
 from mrstrain.records.inputs import read_subject
@@ -56,7 +57,8 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     against_truth = error_against_truth(study, outcomes)
     of_each = [section for of in of_loads.values() for section in of.sections if section.title in study.loads]
     pictures = [] if compared else _side_by_side(study, outcomes)
-    answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures)
+    beside = MeasuredBeside.of(_folders(study, outcomes), study.forces)
+    answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures, beside)
     scans = acquisition_section(_folders(study, outcomes), study.acquisition)
     acquisition = [] if scans is None else [scans]
     credibility = study_credibility(study, outcomes)
@@ -144,8 +146,8 @@ def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdic
     if verdict.reasons:
         return verdict
     registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
-    models = " This is no verdict on the models, which are compared below." if compared else ""
-    return replace(verdict, reasons=(f"{registrations} can be trusted.{models}",))
+    models = " This is a verdict on the measurement; the models are judged below." if compared else ""
+    return replace(verdict, reasons=(f"{registrations} passed all checks.{models}",))
 
 
 def _incomplete(outcomes: Mapping[str, StageOutcome]) -> list[str]:

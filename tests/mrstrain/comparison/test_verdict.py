@@ -65,7 +65,8 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
 def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(study: Path) -> None:
     sound = dict.fromkeys(("Load1", "Load2"), Verdict("trust"))
     assert verdict_on(sound) == Verdict(
-        "trust", ("All 2 registrations can be trusted. This is no verdict on the models, which are compared below.",)
+        "trust",
+        ("All 2 registrations passed all checks. This is a verdict on the measurement; the models are judged below.",),
     )
     assert verdict_on(dict.fromkeys(sound)) is None
     assert verdict_on(sound, ["It is mirrored."]) == Verdict("caution", ("It is mirrored.",))

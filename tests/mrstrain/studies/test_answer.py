@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from dvc.measurement.page import summary_table
 from dvc.report.page import Section, Table
+from dvc.trust.quality import NoiseFloor
 from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
-from mrstrain.measurement.answer import most_strained
+from mrstrain.measurement.answer import MeasuredBeside, most_strained
 from mrstrain.studies.answer import answer_of
 from tests.validate.test_comparison import case, cube, labels, result, sheared
 from validate import NOTHING, Area, Comparison, Criteria, compare
+from validate.tables import Curve
 
 FAT = RegionRow("fat", "max_shear", 10, 1.0, 10, 0.1, 0.0, 0.131, 0.0, 0.3, 0.42, 0.5, 0.6)
 BONE = replace(FAT, region="bone", median=0.0, p95=0.0)
@@ -43,8 +47,8 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
     table, area = first.tables
     assert (first.title, area.title) == ("Models and loads", "Area")
     assert first.paragraphs == (
-        "The measured maximum shear strain is largest in fat under Load1: median 0.131 (0.030 to 0.139), "
-        "95th percentile 0.420.",
+        "The most strained tissue is fat under Load1: measured maximum shear strain 0.131 (0.030 to 0.139) in the "
+        "median and 0.420 at the 95th percentile.",
     )
     assert table.columns == ("load", "tissue", "median", "95th percentile", "best match")
     assert table.rows == (
@@ -53,32 +57,63 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
     )
 
 
-def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_have_none(
+def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_tissues_have_none(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     areas = [
         Area("far", "Load1", "fat", 3.0, 0.3, 3.0, 2.5, 3.5, 0.1),
-        Area("second", "Load1", "fat", 1.4, 0.1, 1.4, 1.1, 1.7, 0.1),
+        Area("second", "Load1", "fat", 1.2, 0.1, 1.2, 1.1, 1.7, 0.1),
+        Area("worse than nothing", "Load1", "fat", 1.4, 0.1, 1.4, 1.1, 1.7, 0.1),
         Area("best", "Load1", "fat", 1.0, 0.1, 1.0, 0.8, 1.2, 0.1),
         Area(NOTHING, "Load1", "fat", 1.3, 0.1, 1.3, 1.1, 1.7, 0.1),
         Area("best", "Load2", "fat", 0.1, 0.1, 0.1, 0.0, 0.2, 0.1),
+        Area("best", "Load3", "fat", 1.0, 0.1, 1.0, 0.8, 1.2, 0.1),
+        Area(NOTHING, "Load3", "fat", 0.9, 0.1, 0.9, 0.8, 1.2, 0.1),
+        Area("best", "Load4", "fat", 0.1, 0.1, 0.1, 0.0, 0.2, 0.1),
+        Area(NOTHING, "Load4", "fat", 0.2, 0.1, 0.2, 0.0, 0.2, 0.1),
     ]
-    known = SimpleNamespace(areas=areas, ranking=SimpleNamespace(uninformative=("Load2",)))
+    above = {"Load1": 1.0, "Load2": 1.0, "Load3": 1.0, "Load4": 0.09}  # of 10 mL, above a strain of .2
+    curves = [
+        Curve(load, "fat", field, np.array([0.0, 0.2, 0.5]), np.array([10.0, above_ml, 0.0]))
+        for load, above_ml in above.items()
+        for field in ("measured", "best")
+    ]
+    known = SimpleNamespace(
+        areas=areas, curves=curves, strains=(0.2, 0.5), ranking=SimpleNamespace(uninformative=("Load2",))
+    )
     monkeypatch.setattr("mrstrain.studies.answer.Comparison", SimpleNamespace(read=lambda _: known))
-    (first,) = answer_of([section("Load1"), section("Load2")], [Section("Models and loads")], tmp_path)
-    assert [row[-1] for row in first.tables[0].rows] == ["best (second)", "–"]
+    (first,) = answer_of([section(load) for load in above], [Section("Models and loads")], tmp_path)
+    assert [row[-1] for row in first.tables[0].rows] == ["best (second)", "–", "none", "–"]
+    assert "less than 1 % above 0.2" in first.tables[0].note
 
 
-def test_the_most_strained_tissue_is_that_of_the_largest_95th_percentile() -> None:
+def test_the_most_strained_tissue_is_that_of_the_largest_lower_end_of_the_95th_percentile() -> None:
     rows = (
         ("Load1", "fat", "0.3 (0.2 to 0.4)", "0.419 (0.4 to 0.5)"),
-        ("Load2", "skin", "0.1", "0.42"),
-        ("Load2", "tendon", "–", "–"),
+        ("Load2", "tendon", "0.3 (0.1 to 0.4)", "0.464 (0.180 to 0.759)"),
+        ("Load2", "skin", "–", "–"),
     )
-    (sentence,) = most_strained(Table("Measured", ("load", "tissue", "median", "95th percentile"), rows))
-    assert sentence.endswith("is largest in skin under Load2: median 0.1, 95th percentile 0.42.")
-    assert most_strained(Table("Measured", ("load", "tissue", "median", "95th percentile"), rows[2:])) == ()
-    assert most_strained(None) == ()
+    columns = ("load", "tissue", "median", "95th percentile")
+    beside = MeasuredBeside({"Load1": "140 N"}, NoiseFloor(0.01, 0.01, 0.0112, 0.0292, 0.1))
+    assert most_strained(Table("Measured", columns, rows), beside) == (
+        "The most strained tissue is fat under Load1 (140 N): measured maximum shear strain 0.3 (0.2 to 0.4) in the "
+        "median and 0.419 (0.4 to 0.5) at the 95th percentile, with 95 % intervals in brackets. The noise floor is "
+        "0.011 and 0.029.",
+    )
+    without = ((*rows[0][:2], "0.3", "0.41"), (*rows[1][:2], "0.3", "0.42"))
+    (plain,) = most_strained(Table("Measured", columns, without))
+    assert plain.startswith("The most strained tissue is tendon under Load2: ")
+    assert most_strained(Table("Measured", columns, rows[2:])) == most_strained(None) == ()
+
+
+def test_the_noise_floor_is_that_of_any_load_and_none_without_a_repeat_scan(tmp_path: Path) -> None:
+    floor = NoiseFloor(0.01, 0.01, 0.0112, 0.0292, 0.1)
+    for name, told in (("Load1", None), ("Load2", asdict(floor))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "quality.json").write_text(json.dumps({"noise_floor": told}))
+    assert MeasuredBeside.of({"gone": tmp_path / "gone", "Load2": tmp_path / "Load2"}).floor == floor
+    assert MeasuredBeside.of({"Load1": tmp_path / "Load1"}).floor is None
+    assert MeasuredBeside.of({}).floor is None
 
 
 def test_intervals_are_told_of_only_where_there_are_any(tmp_path: Path) -> None:
@@ -95,4 +130,4 @@ def test_registrations_alone_and_a_comparison_alone_are_shown_too(folder: Path, 
     assert answer_of([Section("Load1")], [overview], folder) == [overview]
     assert answer_of([], [], folder) == []
     (first,) = answer_of([section("Load1")], [overview], tmp_path)  # the comparison's tables are not there
-    assert [row[-1] for row in first.tables[0].rows] == ["–"]
+    assert first.tables[0].columns == ("load", "tissue", "median", "95th percentile")
