@@ -124,24 +124,25 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
         "u_num": [one.model for one in strains if np.isnan(one.u_num)],
         "u_input": [one.model for one in strains if np.isnan(one.u_input)],
     }
-    cause = "the model itself is wrong: mesh, inputs and measurement do not explain the difference"
+    cause = "The model form is the likely cause: the uncertainties of mesh, inputs and measurement do not explain it."
     if any(lacking.values()):
-        cause = "the measurement does not explain the difference, but a mesh or input listed as not given may do so"
+        cause = "The measurement uncertainty does not explain it; the uncertainties that are not given below may do so."
     words = [
-        f"The comparison error exceeds the expanded validation uncertainty in {beyond} of {len(strains)} quantities of "
-        f"all models in all soft tissue. There, {cause}."
+        "In all soft tissue, the comparison error exceeds the expanded validation uncertainty (2 u_val) in "
+        f"{beyond} of {len(strains)} quantities of all models. {cause}"
     ]
-    words += [f"{u} not given: {', '.join(dict.fromkeys(names))}." for u, names in lacking.items() if names]
+    known_as = {"u_num": "Uncertainty of the mesh (u_num)", "u_input": "Uncertainty of the inputs (u_input)"}
+    words += [f"{known_as[u]} not given: {', '.join(dict.fromkeys(of))}." for u, of in lacking.items() if of]
     if unknown := dict.fromkeys(one.statistic for one in statistics if np.isnan(one.error)):
         words.append(f"D and E are not defined beyond the range of the measured curves: {', '.join(unknown)}.")
-    columns = ("model", "quantity", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E from", "to")
+    columns = ("model", "quantity", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E, lower", "upper")
     table = Table(
         "Comparison error and validation uncertainty (ASME V&V 20)", columns,
         tuple((one.model, one.statistic, *(_cell(v) for v in astuple(one)[4:])) for one in shown),
         "S: simulated; D: measured, with the bias of the measurement removed. Standard uncertainties from the mesh "
-        "(u_num), the other inputs of the model (u_input) and the measurement (u_D); u_val is the root of the sum of "
-        "the squares of those that are known. Interval: E ± 2 u_val; that of the area is its 95 % interval. Strains "
-        "have no unit, volumes and areas are in mL. Single tissues are in comparison_error.csv.",
+        "(u_num), the other inputs of the model (u_input) and the measurement (u_D); u_val is the root sum of squares "
+        "of the known ones. Interval: E ± 2 u_val, for the area its 95 % interval. A dash: not given. Strains have no "
+        "unit, volumes and areas are in mL. Single tissues are in comparison_error.csv.",
     )  # fmt: skip
     return [Section(f"{load}, validation uncertainty", None, (table,), paragraphs=tuple(words), folded=True)]
 

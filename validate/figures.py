@@ -40,8 +40,8 @@ def model_looks(models: Iterable[str]) -> dict[str, Look]:
 def volume_strain(one: LoadComparison, tissues: Sequence[str], models: Sequence[str]) -> Figure:
     """Volume of tissue in which the maximum shear strain exceeds a value: measured (black) and models, same cells.
 
-    A grey band, where the error is known, contains the true curve in 95 % of cases. Areas are computed between the
-    two vertical lines.
+    Grey: 95 % band of the true curve, if the measurement uncertainty is known. The area metric is computed
+    between the two dotted lines.
     """
     curves = curves_of(one, np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS))
     return _curves([c for c in curves if c.tissue in tissues], "tissue", one.criteria.strains, models)
@@ -73,8 +73,8 @@ def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], mode
 def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Figure:
     """Strain-volume curves, measured (black) and simulated, one panel for each load.
 
-    A grey band, where the error is known, contains the true curve in 95 % of cases. Areas are computed between the
-    two vertical lines.
+    Grey: 95 % band of the true curve, if the measurement uncertainty is known. The area metric is computed between the
+    two dotted lines.
     """
     models = [name for name in dict.fromkeys(c.field for c in curves) if name not in ("measured", LOWER, UPPER)]
     return _curves(curves, "load", strains, models)

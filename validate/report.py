@@ -31,7 +31,9 @@ _DIFFERENCES = (  # stem of the files, quantity, its name with its unit in the c
     ("differences_u", "u_mm", "displacement_mm", "Differences of displacement magnitude"),
 )
 _COEFFICIENTS = "coefficients"  # stem of the files
-_AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
+_AGREED = (
+    "measured mean", "model mean", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits, lower", "upper",
+)  # fmt: skip
 _CLOSING = Section(
     "How to read this",
     paragraphs=(
@@ -46,14 +48,14 @@ _CLOSING = Section(
         "of centroids, the Hausdorff distance (95th percentile) and the agreement cell by cell show where the fields "
         "differ.",
         "Intervals and the grey band have 95 % coverage. They come from the error model of the registration: true "
-        "fields that are consistent with the measured one are drawn, and the model's area to each is computed. If an "
-        "interval excludes the area as measured, noise and smoothing have shifted the measured curve. Two models "
-        "differ significantly if the same one has the smaller area in 97.5 % of the draws, widened like the intervals.",
+        "strain fields that are consistent with the measured one are sampled, and the area between the model's curve "
+        "and that of each sample is computed. An interval may exclude the area as measured, because noise and "
+        "smoothing shift the measured curve. Two models differ significantly if one has the smaller area in at least "
+        "97.5 % of the samples, whose spread is widened like the intervals.",
         "A measurement without a label map smooths strain discontinuities at tissue interfaces over 3 to 5 mm, and "
         "noise increases small shear strains; a model does neither. A comparison cannot show effects that the "
-        "measurement cannot detect: scanner distortion, creep during a scan, and tissue that slides along a smooth "
-        "skin or inside a uniform region. Strain thresholds are not injury thresholds, unless their table says so "
-        "with a reason.",
+        "measurement cannot detect: scanner distortion, creep during a scan, and sliding along smooth skin or within a "
+        "uniform region. Strain thresholds are not injury thresholds, unless their source below gives a reason.",
     ),
 )  # fmt: skip
 
@@ -132,9 +134,9 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
     most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
     return Viewer(
         "Interactive 3-D viewer",
-        f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}, over the "
-        "registered image of the first load. Drag to move through the slices; drag with the right button to rotate. "
-        "Both views move together. The viewer needs WebGL 2.",
+        f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and simulated by {model.name}. "
+        "Behind it: the registered image of the first load. Drag to move through the slices; drag with the right "
+        "button to rotate. Both views move together. The viewer needs WebGL 2.",
         Volume.image("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
         (Volume.overlay("measured", grid, shear[0], most), Volume.overlay(model.name, grid, shear[1], most)),
     )
@@ -144,8 +146,10 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     """Sections of a load: amount and location of strain, agreement cell by cell, and what the standards ask for."""
     verdict = one.case.verdict
     words = [
-        "Compared volume: {common:.1f} mL of {mesh:.1f} mL of soft tissue in the mesh; the measurement is defined in "
-        "{measured:.1f} mL.".format(**one.fields.coverage())
+        "Compared: {common:.1f} mL of the {mesh:.1f} mL of soft tissue in the mesh. The measurement is defined in "
+        "{measured:.1f} mL of it. Volumes and percentiles under Registration are those of the whole label map.".format(
+            **one.fields.coverage()
+        )
     ]
     words += [] if verdict is None else [f"Verdict on the registration: {verdict.words}."]
     curves, slices, *others = (picture for stem, picture in pictures.items() if stem != _COEFFICIENTS)
@@ -229,16 +233,18 @@ def area_rows(areas: Iterable[Area], ranking: Ranking, loads: Sequence[str]) -> 
 
 def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
     low, high = loads[0].criteria.strains
+    levelled = any(area.levelled for area in ranking.areas)
     *rows, nothing = area_rows([a for one in loads for a in one.areas], ranking, [one.load for one in loads])
     return Table(
-        f"Area between the strain-volume curves of soft tissue, strains {low:g} to {high:g}, mL",
+        f"Area between measured and simulated strain-volume curves, all soft tissue, strain {low:g} to {high:g}, mL",
         ("model", "rank", *(_head(one) for one in loads), "all loads"),
         tuple(rows),
-        "The best model over all loads is first; the rank is a range if models are not distinguishable. If the "
-        "measurement uncertainty is known, the area is the median over the drawn true fields, with a 95 % interval. "
-        "Areas as measured and areas by tissue are given below and in areas.csv. Models of a forward-model comparison "
-        "are last, with their area as measured. The row below the line, no deformation, predicts zero "
-        "strain everywhere; models that are no better than it are marked in the column rank.",
+        "Best model over all loads first; a rank such as 1–2 means that models are not distinguishable. If the "
+        "measurement uncertainty is known, areas are estimates with noise and smoothing removed, with 95 % intervals. "
+        "Areas as measured and areas by tissue are given below and in areas.csv."
+        + " The sum over all loads includes those that are not informative." * bool(ranking.uninformative)
+        + " Models of a forward-model comparison are last, with their area as measured." * levelled
+        + " Last row: a model that predicts zero strain everywhere; models whose area is no smaller are marked.",
         (nothing,),
     )
 
@@ -248,13 +254,16 @@ def _tissues(one: LoadComparison) -> Table:
         return tuple((a.model, a.tissue, a.ml, 100.0 * a.share, *astuple(a)[5:]) for a in areas)
 
     return Table(
-        "Area between the curves, by tissue",
-        ("model", "tissue", "as measured, mL", "normalised, %", "estimate, mL", "95 % from", "to", "perfect model"),
+        "Area between measured and simulated strain-volume curves, by tissue",
+        ("model", "tissue", "as measured, mL", "normalised, %", "estimate, mL", "95 % interval, lower", "upper",
+         "perfect model, mL"),
         cells(a for a in one.areas if a.model != NOTHING),
-        "As measured: with the noise and smoothing of the measurement. Estimate and interval: with these removed. "
-        "Perfect model: the area that noise alone causes; an interval that reaches it begins at 0.",
+        "As measured: with the noise and smoothing of the measurement. Estimate and interval: corrected for both by "
+        "the error model. Perfect model: the area that noise alone would cause; an interval whose lower end is smaller "
+        "begins at 0, because a perfect model is not excluded. Areas of tissues do not add up to that of all soft "
+        "tissue, in which over- and underestimates cancel.",
         cells(a for a in one.areas if a.model == NOTHING),
-    )
+    )  # fmt: skip
 
 
 def _location(one: LoadComparison) -> Table:
@@ -267,26 +276,26 @@ def _location(one: LoadComparison) -> Table:
         for o in one.overlaps
     )  # fmt: skip
     perfect: dict[float, tuple[Cell, ...]] = {
-        o.threshold: ("perfect", o.threshold, "", "", "", "", _ranged(o.dice_perfect),
+        o.threshold: ("perfect model", o.threshold, "", "", "", "", _ranged(o.dice_perfect),
                       _ranged(o.centroids_perfect_mm), "", _ranged(o.hausdorff95_perfect_mm))
         for o in one.overlaps
         if not np.isnan(o.measured_low_ml)
     }  # fmt: skip
     known = (
-        "In brackets: 95 % intervals with the bias and noise of the measurement removed; they may exclude the value as "
-        "measured. Below the line: values of a perfect model, from noise alone; an interval that reaches such a value "
-        "is extended to 1, or to 0 mm. "
+        "In brackets: 95 % intervals with the bias and noise of the measurement removed; the value as measured may lie "
+        "outside. Below the line: values that a perfect model would get from noise alone; an interval that includes "
+        "them is extended to perfect agreement (1, or 0 mm). "
         if perfect
         else "The measurement uncertainty is unknown, so there are no intervals. "
     )
     return Table(
         "Tissue above a strain threshold: volume and location",
-        ("model", "above", "measured, mL", "model, mL", "clusters", "mean max. shear", "Dice", "centroids, mm",
-         "largest, mm", "Hausdorff, mm"),
+        ("model", "above", "measured, mL", "model, mL", "clusters", "mean max. shear", "Dice",
+         "distance of centroids, mm", "of largest clusters, mm", "Hausdorff distance, mm"),
         rows,
-        known + "Clusters are connected cells with at least the smallest volume. Their number and mean maximum shear "
-        "strain are given as measured / model. Centroids: distance between the centroids of all clusters together; "
-        "largest: between those of the largest clusters. Hausdorff: 95th percentile of the Hausdorff distance.",
+        known + f"Clusters: connected cells above the threshold of at least {one.criteria.least_ml:g} mL. Their number "
+        "and mean maximum shear strain are given as measured / model. Centroids: of all clusters together, and of the "
+        "largest clusters. Hausdorff distance: 95th percentile.",
         tuple(perfect.values()),
     )  # fmt: skip
 
@@ -300,10 +309,10 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
 
 def _agreement(one: LoadComparison) -> tuple[Table, ...]:
     """Agreement cell by cell: by tissue, and, where there is bone, by distance to bone."""
-    names, tissues = {"max_shear": "shear", "u_mm": "u, mm"}, (ALL, *one.fields.tissues)
+    names, tissues = {"max_shear": "max. shear", "u_mm": "u, mm"}, (ALL, *one.fields.tissues)
     rows: list[tuple[Cell, ...]] = [(a.model, names[a.quantity], a.part, *_rounded(a, 6)) for a in one.agreements]
     by_distance = Table(
-        "Agreement by distance to bone", ("model", "quantity", "from bone", *_AGREED),
+        "Agreement by distance to bone", ("model", "quantity", "distance to bone", *_AGREED),
         tuple((*row[:2], str(row[2]).removesuffix(" from bone"), *row[3:]) for row in rows if row[2] not in tissues),
         "In all soft tissue, as above.",
     )  # fmt: skip
@@ -315,7 +324,7 @@ def _agreement(one: LoadComparison) -> tuple[Table, ...]:
             "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
             "concordance, and Bland-Altman limits of agreement. For displacement, regression and concordance pool the "
             "three components, RMSE is that of the difference vector, and the other values are of the magnitude. All "
-            "values are as measured and have no intervals; there is no error model of displacement.",
+            "values are as measured and have no intervals.",
         ),
         *((by_distance,) if one.bones else ()),
     )
@@ -329,12 +338,12 @@ def _rounded(row: Agreement | SkinDisplacement, first: int) -> tuple[float, ...]
 def _skin(one: LoadComparison) -> Table:
     return Table(
         "Skin under the plate, and volume change of the fat",
-        ("model", "nodes", "inward, measured, mm", "model, mm", "tangential, measured, mm", "model, mm",
-         "fat's volume change, measured, %", "model, %"),
+        ("model", "contact nodes", "normal, measured, mm", "normal, model, mm", "tangential, measured, mm",
+         "tangential, model, mm", "volume change of fat, measured, %", "model, %"),
         tuple(
             (t.model, t.nodes, *_rounded(t, 3)[:4], *(100.0 * change for change in _rounded(t, 3)[4:]))
             for t in one.skin
         ),
-        "Mean displacement 1 mm inside the skin that is on the plate in the model: inward (against the plate's outward "
-        "normal) and tangential. Volume change: mean of det F - 1.",
+        "Mean displacement 1 mm below the surface of the skin, over the nodes that touch the plate in each model: "
+        "normal to the plate, positive towards the body, and tangential. Volume change: mean of det F - 1.",
     )  # fmt: skip

@@ -85,15 +85,16 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
     rows = {r.model: r for r in one.representations if r.tissue == tissue}
     best, nothing = rows[names[0]], rows[NOTHING]
     return (
-        f"In {tissue}, the probability of representation is {100.0 * best.probability:.0f} % for {best.model} and "
-        f"{100.0 * nothing.probability:.0f} % for no deformation. Each coefficient counts by the size of its error: "
-        f"{best.in_band} of the {best.coefficients} coefficients of {best.model} lie within their uncertainty.",
+        f"In {tissue}, the largest tissue, the probability that the model represents the measurement is "
+        f"{100.0 * best.probability:.0f} % for {best.model} and {100.0 * nothing.probability:.0f} % for no "
+        "deformation; similar values mean that this metric does not distinguish them. "
+        f"{best.in_band} of the {best.coefficients} coefficients of {best.model} lie within their uncertainty; "
+        "coefficients count by the size of their error.",
         _accepted(best),
         f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "
         f"{100.0 * best.guide_probability:.0f} % for {best.model} and {100.0 * nothing.guide_probability:.0f} % for no "
-        "deformation. "
-        "In three dimensions this band is wider than most coefficients, so the first probability, "
-        "with an uncertainty for each coefficient, is more informative.",
+        "deformation. In three dimensions, this uncertainty is larger than most coefficients, so the probability "
+        "above, with an uncertainty for each coefficient, is more informative.",
     )
 
 
@@ -102,9 +103,9 @@ def _accepted(of: Representation) -> str:
     clusters = f"{of.clusters} cluster{'' if of.clusters == 1 else 's'} above three times the residual"
     figures = f"residual {of.u_rec:.3f}, measurement uncertainty {of.u_cal:.3f}, {clusters}"
     if of.accepted:
-        return f"{functions}, as the guide asks ({figures})."
+        return f"{functions}, which CWA 16799 accepts ({figures})."
     what = "The probability applies only to the part of the strain that these coefficients represent."
-    return f"{functions}, which the guide does not accept ({figures}). {what}"
+    return f"{functions}, which CWA 16799 does not accept ({figures}). {what}"
 
 
 def _representations(one: LoadComparison) -> Table:
@@ -117,13 +118,14 @@ def _representations(one: LoadComparison) -> Table:
 
     return Table(
         "Image decomposition, by tissue",
-        ("model", "tissue", "probability, %", "in band", "residual", "uncertainty", "clusters", "accepted",
-         "model's residual", "by CWA's band, %"),
+        ("model", "tissue", "probability, %", "within uncertainty", "residual", "uncertainty", "clusters", "accepted",
+         "residual of the model", "probability by CWA 16799, %"),
         cells(nothing=False),
         "Probability that the simulated maximum shear strain represents the measured one within its uncertainty "
-        "(Dvurecenska and others 2018), from coefficients of orthonormal functions on the tissue's cells. In band: "
-        "coefficients within the expanded uncertainty of each. Accepted: the residual of the measured field is within "
-        "the measurement uncertainty, and no cluster of residuals above three times that fills 0.3 % of the tissue.",
+        "(Dvurecenska and others 2018), from coefficients of orthonormal functions on the tissue's cells. Within "
+        "uncertainty: coefficients within the expanded uncertainty of each. Accepted: the residual of the measured "
+        "field is within the measurement uncertainty, and no cluster of cells with more than three times the residual "
+        "fills 0.3 % of the tissue.",
         cells(nothing=True),
     )  # fmt: skip
 
@@ -137,10 +139,11 @@ def _model_forms(one: LoadComparison) -> Table:
 
     return Table(
         "Modified area validation metric, by tissue",
-        ("model", "tissue", "measured mean", "model's mean", "from", "to", "d+", "d−"),
+        ("model", "tissue", "measured mean", "model mean", "lower", "upper", "d+", "d−"),
         cells(nothing=False),
         "Over all strains, as measured: d+ is the area between the distributions where the measured maximum shear "
-        "strain is the larger, d− where it is the smaller (Voyles and Roy 2015). Every percentile of the model has the "
-        "interval that its mean has here, from − d− to + d+. Cells are not samples: no factor for few samples is used.",
+        "strain is larger, d− where it is smaller (Voyles and Roy 2015). Lower, upper: interval of the mean, from "
+        "model mean − d− to model mean + d+; that of a percentile is found in the same way. The factor for few samples "
+        "is not used, because cells are not samples.",
         cells(nothing=True),
     )

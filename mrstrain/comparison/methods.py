@@ -257,7 +257,7 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
     return (
         f"The intervals (95 % coverage) of areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) were computed "
         "from true fields drawn with the error model of the registration (bias and spatially correlated noise). "
-        f"{_sources(errors)} {twin or ''}{decomposed}There is no error model of displacement."
+        f"{_sources(errors)} {twin or ''}{decomposed}Displacement was compared without intervals."
     )
 
 

@@ -53,10 +53,11 @@ def test_the_answer_comes_first_and_names_model_tissue_and_probability() -> None
     one = compared(0.0, 0.01)
     first, accepted, guide = answer(one)
     assert first == (
-        "In fat, the probability of representation is 100 % for right and 0 % for no deformation. It is weighted by "
-        "the size of the errors: 1 of the 1 coefficients of right lie within their uncertainty."
+        "In fat, the largest tissue, the probability that the model represents the measurement is 100 % for right and "
+        "0 % for no deformation; similar values mean that this metric does not distinguish them. 1 of the 1 "
+        "coefficients of right lie within their uncertainty; coefficients count by the size of their error."
     )
-    assert "as the guide asks (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
+    assert "which CWA 16799 accepts (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
     assert guide.startswith(
         "CWA 16799 gives one uncertainty to all coefficients; with it, the probability is 100 % for right"
     )
@@ -101,5 +102,5 @@ def test_tables_and_figure_are_written_and_told_in_the_report(tmp_path: Path) ->
     assert (tmp_path / "Load1" / "coefficients.csv").is_file()
     page = (tmp_path / "report.html").read_text()
     assert "Load1, standard metrics (CWA 16799, MAVM)" in page
-    assert "In fat, the probability of representation is 100 % for right" in page
+    assert "the probability that the model represents the measurement is 100 % for right" in page
     assert Comparison.read(tmp_path).model_forms[0].d_plus == pytest.approx(done.model_forms[0].d_plus, abs=1e-6)
