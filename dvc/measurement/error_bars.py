@@ -67,7 +67,7 @@ class ErrorBars:
         return lines + [f"Error bars: {self.of_twin}"] * bool(self.of_twin)
 
 
-NO_ERROR_BARS = ErrorBars(None, "A repeat scan has none: its strain is the error.")
+NO_ERROR_BARS = ErrorBars(None, "A repeat scan has no error bars: all of its apparent strain is error.")
 """Those of a repeat scan."""
 
 
@@ -108,7 +108,7 @@ def error_bars(
     sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
     sure = replace(sure, components=components_of(maps, regions, to_bone, table, wider))
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
-    own_errors = f"Errors of their own: {known}; all other tissues use" if known else "All tissues use"
+    own_errors = f"Errors were measured for {known}; other tissues use" if known else "All tissues use"
     voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
     other = "" if own == voxel else f" (these images: voxels of {own} mm)"
     told = (
@@ -158,11 +158,11 @@ def _of_twin(rows: Sequence[Judged], twin: TwinCheck | None) -> str:
 
 def _held(table: ErrorTable) -> str:
     if not np.isfinite(table.widening):
-        return "The coverage of these intervals is not known, because the study has only one registration."
+        return "The coverage of these intervals is not known: the error model rests on a single registration."
     factors = {f"{factor:.1f}" for factor in (table.widening_of or {"": table.factor}).values()}
     times = " to ".join(dict.fromkeys((min(factors, key=float), max(factors, key=float))))
-    whose = "of finite-element models" if table.widening_of else "of the study when each part of it is left out"
-    return f"Intervals are widened {times} times, so that they contain 95 % of the true values {whose}."
+    where = "image pairs moved by finite-element solutions" if table.widening_of else "the parts of the study left out"
+    return f"Intervals are widened {times} times, so that they contain 95 % of the true values in {where}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:

@@ -28,9 +28,9 @@ SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
 FIXED_WEIGHTS = "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
 """In place of the table of weights, for a repeat scan."""
 _COMPONENTS = (
-    "Root mean square over the voxels of the tissue. It applies to u_x, u_y and u_z, to E_xx, E_yy and E_zz, and to "
-    "E_xy, E_xz and E_yz, in any axes; the expanded uncertainty (k = 2) is twice as large. components.csv has means "
-    "and biases."
+    "Root mean square over the voxels of the tissue: of u_x, u_y and u_z; of E_xx, E_yy and E_zz; of E_xy, E_xz and "
+    "E_yz. The values are the same in any coordinate system. The expanded uncertainty (k = 2) is twice as large. "
+    "components.csv has means and biases."
 )
 _TWIN = (
     "The unloaded image was warped by the measured displacement, fresh noise was added, and the pair was registered "
@@ -60,7 +60,7 @@ def drawings_of(
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
     through = "Slices through the middle of the tissue."
     if bone is not None:
-        through = "Slices through the lowest point of the bone along the plate normal."
+        through = "Slices through the point of the bone that is nearest to the plate."
     shear = Drawing.of(STRAIN, figures.strain_slices, *strain, note=through)
     if images is not None:
         both = {"unloaded": reference, f"{loaded}, registered": Image(reference.grid, images.registered)}
@@ -92,7 +92,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     held = "body" if alignment.get("on") == "image" else "bone"
     rows = [(f"Rotation of the {held} between the scans", alignment["rotation_deg"], "degrees")]
     if "bone_shift_lps_mm" in alignment:
-        spread = f"Spread of the rigid alignment between halves of the {held} (rms over it; largest of six pairs)"
+        spread = f"Repeatability of the rigid alignment: largest rms difference between fits on halves of the {held}"
         spacing = " x ".join(f"{s:.3g}" for s in alignment["control_spacing_mm"])
         rows += [
             (f"Shift of the {held} between the scans", float(np.linalg.norm(alignment["bone_shift_lps_mm"])), "mm"),
@@ -105,12 +105,12 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     if quality.similarity is not None:
         each = zip(("as scanned", "after rigid alignment", "after registration"), quality.similarity, strict=True)
         rows += [(f"Local similarity in the tissue, {said}", float(value), "") for said, value in each]
-        rows.append(("Highest local similarity possible with noise as in the air, about", quality.most_similarity, ""))
-    bone = "in the bone, before it was made rigid" if quality.bone_held else "in the bone"
+        rows.append(("Local similarity expected of equal images with this noise", quality.most_similarity, ""))
+    bone = "in the bone without the rigid constraint" if quality.bone_held else "in the bone"
     if held == "bone":
         rows += [
-            (f"Apparent displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
-            (f"Apparent maximum shear strain {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
+            (f"Apparent displacement {bone} (true value 0), rms", quality.bone_shift_mm, "mm"),
+            (f"Apparent maximum shear strain {bone} (true value 0), 95th percentile", quality.bone_shear_p95, ""),
         ]
     rows += [
         ("Folded voxels (det F <= 0)", quality.folded_voxels, "voxels"),
@@ -129,7 +129,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
             ("Noise floor (repeat scan): maximum shear strain, median", floor.max_shear_p50, ""),
             ("Noise floor (repeat scan): maximum shear strain, 95th percentile", floor.max_shear_p95, ""),
             ("Noise floor (repeat scan): mean absolute strain component, mean over voxels (MAER)", floor.maer, ""),
-            ("Noise floor (repeat scan): the same, standard deviation over voxels (SDER)", floor.sder, ""),
+            ("Noise floor (repeat scan): mean absolute strain component, standard deviation (SDER)", floor.sder, ""),
         ]
     return Table("Key results", ("result", "value", "unit"), tuple(rows))
 
@@ -180,7 +180,7 @@ def error_tables(bars: ErrorBars) -> list[Table]:
         rows = tuple(
             (i.region, _words(i.statistic), i.found, i.estimate, i.low, i.high) for i in bars.uncertainty.intervals
         )
-        columns = ("region", "statistic", "measured", "bias removed", "95 % interval from", "to")
+        columns = ("region", "statistic", "measured", "bias removed", "95 % interval, lower", "upper")
         tables.append(Table("Maximum shear strain with 95 % intervals", columns, rows, bars.explanation))
         if bars.uncertainty.components is not None:
             tables.append(_component_table(bars.uncertainty.components))
@@ -200,7 +200,9 @@ def _component_table(known: ComponentUncertainty) -> Table:
     columns = "region", "displacement, mm", "normal strain", "shear strain"
     regions = dict.fromkeys(row.region for row in known.rows)
     rows = [(name, of[name, "x"], of[name, "xx"], of[name, "xy"]) for name in regions]
-    return Table("Standard uncertainty of a component in one voxel", columns, tuple(rows), _COMPONENTS)
+    return Table(
+        "Standard uncertainty of displacement and strain components in one voxel", columns, tuple(rows), _COMPONENTS
+    )
 
 
 def _words(statistic: str) -> str:

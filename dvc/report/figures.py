@@ -29,7 +29,7 @@ from dvc.trust.regions import volume_above
 
 MAX_SHEAR = "maximum shear strain (E₁ − E₃)/2, no unit"
 SIGMA = "standard uncertainty of the maximum shear strain, no unit"
-_DISPLACEMENT = "length of the displacement relative to the bone, mm"
+_DISPLACEMENT = "displacement magnitude relative to the bone, mm"
 _COLOURS = {  # what is drawn with its unit, and the name of its colour map
     "max_shear": (MAX_SHEAR, "viridis"), "sigma": (SIGMA, "cividis"), "displacement_mm": (_DISPLACEMENT, "viridis"),
     "jacobian": ("volume ratio det F, no unit", "PuOr_r"),
@@ -46,9 +46,9 @@ _WRITTEN = np.linspace(0.0, _HIGHEST_SHEAR, 121)
 def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> Figure:
     """Unloaded image in green, loaded image in magenta; before and after the non-rigid part of the registration.
 
-    Grey: both images agree. A faint tint over a whole region comes from different bias fields. A coloured rim is an
-    edge that is at another position in the other image. Yellow marks show where the other planes cut. Dark blue: not
-    in the loaded image.
+    Grey: both images agree. A faint tint over a whole region comes from different bias fields. Coloured rims
+    are edges that do not coincide. Yellow marks show the positions of the other slices. Dark blue: not in the loaded
+    image.
     """
     sheet = Sheet(view, _STAGES)
     for plane, axes, green, magenta in _beside(sheet, reference, (rigid, registered)):

@@ -38,11 +38,12 @@ class Strip:
 
 
 def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
-    """Maximum shear strain in one slice of the unloaded anatomy under each load.
+    """Maximum shear strain under each load, in one slice of the unloaded anatomy.
 
-    On the left, the unloaded image, or its label map if there is no image. White lines are the surfaces of the body
-    and of the bones. The image is grey where strain is not defined. The colour bar ends at the 98th percentile of all
-    that is shown, rounded up to 0.05.
+    On the left, the unloaded image, or its label map if there is no image. A anterior, P posterior, S superior, I
+    inferior, R right, L left. White lines are the surfaces of the body and of the bones. Grey: strain is not defined
+    (not measured, or outside the mesh of a model). The colour scale ends at the 98th percentile of all that is shown,
+    rounded up to the next multiple of 0.05.
     """
     # A row for each name; they are those of `Strip.max_shear`.
     first, many = strips[0], len(rows) > 1

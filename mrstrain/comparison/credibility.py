@@ -31,8 +31,8 @@ TITLE = "Credibility (ASME V&V 40, FDA)"
 """Title of the section of a report."""
 _ABOUT = (
     "Evidence in this report for a credibility assessment after ASME V&V 40-2018 and FDA's guidance of 17 November "
-    "2023. The program fills in what it knows and grades nothing: a person judges levels and risk. All else comes from "
-    '[credibility] in the study file; entries missing there are "not given".'
+    "2023. The program lists what it knows and assigns no level or risk: these are for you to judge. Everything else "
+    'comes from [credibility] in the study file; what is missing there is "not given".'
 )
 CODE = (
     "Order of convergence of displacement and its gradient (closed-form solution, nearly incompressible tissue): P1 "
@@ -128,8 +128,8 @@ def _evidence(held: Holdings) -> Table:
         ("8. Calculation verification and UQ results", _sentences(_calculated(held), _uncertainties(held))),
     )  # fmt: skip
     note = (
-        "Categories of FDA's guidance. A comparison counts as in vivo only with a living subject: with a phantom it is "
-        "a test of the program, with a specimen a bench test."
+        "Categories of FDA's guidance. A comparison is in vivo evidence only if the subject is living. With a phantom, "
+        "it tests the program; with a specimen, it is a bench test."
     )
     return Table("Evidence by category", ("category", "what this report holds"), rows, note)
 
@@ -175,7 +175,7 @@ def _solved(held: Holdings) -> str:
     if not loads:
         return ""
     short = ", ".join(f"{model} {load} {part:.0%}" for model, load, part in loads if part < 1.0)
-    reached = f"reached in part: {short}" if short else f"all {len(loads)} loads reached"
+    reached = f"reached in part: {short}" if short else "all loads reached by all models"
     force = f"{100.0 * Tolerance().force:g} % of those on the plate and the fixed nodes"
     most = f"at most {force}, or ten times that if the iteration stagnates"
     return f"Residual forces at the end of a load: {most}; {reached}"
@@ -200,13 +200,13 @@ def _in_intervals(models: Sequence[str]) -> str:
 def _calibration(held: Holdings) -> Table:
     rows = used_for_calibration(held.models)
     by_person = ("Elsewhere", "", held.given.calibration) if held.given.calibration else None
-    nothing = ("Nothing was found in the records", "", "")
+    nothing = ("No calibration data in the records of the models", "", "")
     note = (
         "Found in the records of the models. Bones are rigid in the models, and in the measurement their motion is "
         "removed: agreement at the bone is not evidence. Models that were meshed from the label map of the measurement "
         "share its errors."
     )
-    columns = ("data", "used for", "so it cannot validate")
+    columns = ("data", "used for", "no evidence for")
     return Table("Used for calibration", columns, (*rows, *([by_person] if by_person else [])) or (nothing,), note)
 
 
@@ -242,7 +242,7 @@ def _factors(held: Holdings) -> Table:
         ("Numerical code verification", "See evidence 1", given.level_code_verification),
         ("Discretization error", _sentences(meshes, "See evidence 8"), given.level_discretization_error),
         ("Numerical solver error", "See evidence 8", given.level_solver_error),
-        ("Use error", "Inputs are checked before a run; a second person's check is not known here",
+        ("Use error", "Inputs are checked before a run; whether a second person checked them is not recorded",
          given.level_use_error),
         ("Model form", _told(laws), given.level_model_form),
         ("Model inputs", _sentences(f"Parameters: {_told(titles)}", f"Loads: {_told(conditions)}"),
@@ -257,7 +257,7 @@ def _factors(held: Holdings) -> Table:
         ("Relevance of the validation activities to the context of use", "See Applicability, above",
          given.level_relevance_of_validation),
     )  # fmt: skip
-    columns = ("factor", "what this report holds", "level, judged by a person")
+    columns = ("factor", "what this report holds", "level (your judgement)")
     return Table("Credibility factors", columns, tuple((*row[:2], _told(row[2])) for row in rows))
 
 
@@ -268,5 +268,5 @@ def _equivalent(held: Holdings) -> str:
     verdict = held.comparison.verdict
     reasons = () if verdict is None or verdict.level == "trust" else verdict.reasons
     doubts = " ".join(alike(reason for reason in reasons if ", registration (" not in reason))  # of the models
-    doubts = doubts or "no sign of another place, unit or frame"
+    doubts = doubts or "no check found another position, unit or frame"
     return f"Models and measurement in one frame, on the same cells. Inputs of the models: {doubts}"

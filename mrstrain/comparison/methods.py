@@ -129,10 +129,10 @@ def _labels(made: Mapping[str, Any] | None) -> str:
     """How the label map was made if that is known: a sentence after a space, or nothing."""
     if not made:
         return ""
-    how = "from the unloaded image by mrstrain: skin by a layer model of the brightness below the surface, bones by a"
+    how = "from the unloaded image by mrstrain: skin with a layer model of the brightness below the surface, bones with"
     uncertain = made.get("uncertain", made.get("unsure", np.nan))  # the latter in older records
     doubt = f"{100.0 * uncertain:.0f} % of its voxels had a probability below 90 %"
-    return f" The label map was made {how} watershed, and fat and muscle by total variation (Chambolle 2005); {doubt}."
+    return f" The label map was made {how} a watershed, fat and muscle by total variation (Chambolle 2005); {doubt}."
 
 
 def _files(record: Record) -> str:
@@ -210,7 +210,7 @@ def _solver(record: Record) -> str:
     parameters, versions = record["parameters"], record.get("versions", {})
     made = parameters.get("mesh_made")
     mesh = made and (
-        f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}) with edges of {made['edge_mm']:g} mm"
+        f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}; requested edge length {made['edge_mm']:g} mm)"
     )
     loads = _listed([f"{step['name']} {LoadStep(**step)}" for path in parameters["paths"] for step in path])
     axes = {load: of.get("plate_axes_lps") for load, of in record.get("outcome", {}).items()}

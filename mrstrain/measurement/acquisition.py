@@ -31,11 +31,11 @@ _PARAMETERS = {
     "flip_angle_deg": "Flip angle, degrees", "acquisition_matrix": "Matrix of the acquisition",
 }  # fmt: skip
 _NOTE = (
-    "Header: DICOM, or the JSON file of dcm2niix beside a NIfTI file. Its texts are shown only if they are known "
-    "names of scanners and sequences, so that no patient is named. A study file can give the rest, under "
-    "[acquisition]. SNR: 75th percentile of the tissue over the standard deviation of the noise. Standard uncertainty: "
-    "standard deviation of the error. The spatial resolution was measured on phantoms only (benchmark record, Spatial "
-    "resolution)."
+    "Source header: DICOM, or the JSON file of dcm2niix beside a NIfTI file. Its texts are shown only if they are "
+    "known names of scanners and sequences, so that no patient is named. A study file can give the rest, under "
+    "[acquisition]. SNR: 75th percentile of the signal in tissue, divided by the standard deviation of the noise. "
+    "Standard uncertainty: standard deviation of the error. The spatial resolution was measured on phantoms only "
+    "(documentation, Benchmarks, Spatial resolution)."
 )
 _WEIGHTS = {"bending": "1/mm", "volume": "1/mm³", "rigidity": "1/mm³", "volume_gradient": "1/mm"}
 _SPLINE_ALONE = "none but the control point spacing"
@@ -166,7 +166,7 @@ class _Known:
         spacing = {load: _sizes(self._alignment(load).get("control_spacing_mm")) for load in self.qualities}
         yield self._measured("Control point spacing of the displacement, mm", _together(spacing), source="registration")
         weights = {load: _weights(of) for load, of in self.qualities.items()}
-        yield self._measured("Regularisation, weights", _together(weights), source="registration")
+        yield self._measured("Regularisation weights", _together(weights), source="registration")
         yield self._measured("Spatial resolution of the strain", NOT_GIVEN, self.given.spatial_resolution)
 
     def _alignment(self, load: str) -> Record:

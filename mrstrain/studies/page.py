@@ -103,7 +103,7 @@ def write_page_in_progress(
     pictures = tuple(picture for section in of_loads for picture in _strain(section))
     sections = [
         *answer_of(of_loads, (), study.out, pictures),
-        Section("Progress", None, (Table("Stages", ("stage", "state", "what it found"), tuple(rows)),)),
+        Section("Progress", None, (Table("Stages", ("stage", "status", "summary"), tuple(rows)),)),
     ]
     write_report(path, study.study.name, None, sections, (), {}, notes=[told], reload_s=None if ended else _RELOAD_S)
 
@@ -179,5 +179,5 @@ def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:
         result = _result(one.result)
         seconds = None if one.record is None else one.record.seconds
         rows.append((name, one.status, seconds, "\n".join((reason, *result)).strip()))
-    note = "Time of the run that made the result, on one core while other stages were running."
+    note = "Wall time of the run that made the result, on one core, while other stages were running."
     return Section("Stages", None, (Table("Stages", ("stage", "status", "time, s", "summary"), tuple(rows), note),))

@@ -22,8 +22,8 @@ _PARTS = {
 }  # fmt: skip
 # of the time of a registration or a comparison: when each of its parts begins, and how much of it the part takes
 _LEFT_OUT = (
-    "The variants for the input uncertainty of the models were skipped (quick): intervals and significant "
-    "differences take mesh, forces, directions and parameters of simulated models as exact."
+    "The input uncertainty of the models was skipped (quick): intervals and significant differences treat mesh, "
+    "forces, directions and parameters of simulated models as exact."
 )
 
 

@@ -17,7 +17,10 @@ TABLE = "error.csv"
 _MADE = "registered_utc"
 _HEADER = ("load", _MADE, *(f.name for f in fields(TissueError)))
 _FIGURES = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "u_p50_mm", "u_p95_mm")
-_COLUMNS = ("load", "tissue", "true max. shear, median", "p95", "RMSE", "bias", "u error, median", "u error, p95")
+_COLUMNS = (
+    "load", "tissue", "true max. shear, median", "true max. shear, p95", "error of max. shear, RMSE", "bias",
+    "displacement error, mm, median", "p95",
+)  # fmt: skip
 
 
 def write_errors(path: Path, errors: Mapping[str, Sequence[TissueError]], outcomes: Mapping[str, StageOutcome]) -> None:
@@ -65,7 +68,7 @@ def error_against_truth(study: Study, outcomes: Mapping[str, StageOutcome]) -> l
     figures = tuple(
         (load, one.tissue, *(getattr(one, key) for key in _FIGURES)) for load, of in known.items() for one in of
     )
-    note = "Displacement in mm. The calcaneus and the ankle bones are rigid, so their true shear is zero."
+    note = "Bones are rigid: their true shear is zero, and the registration constrains that of the rigid alignment."
     if old := dict.fromkeys(row["load"] for row in rows if row["load"] not in known):
         note += f" Unknown for {', '.join(old)}, registered again since; `mrstrain demo` computes the error."
     table = Table("Error of max. shear and displacement, by load and tissue", _COLUMNS, figures, note)
@@ -74,7 +77,7 @@ def error_against_truth(study: Study, outcomes: Mapping[str, StageOutcome]) -> l
         "the truth. For real images there is no such table; use the verdict, the intervals and the repeat scan. The "
         "phantom deforms by a prescribed motion, without forces, so no material set is the true one."
     )
-    return [Section("Error against the truth", None, (table,), (), (text,))]
+    return [Section("Measurement error (phantom with known strain)", None, (table,), (), (text,))]
 
 
 def _made(outcomes: Mapping[str, StageOutcome], load: str) -> str:

@@ -54,8 +54,8 @@ class Report:
         state, when = f"{len(outcomes)} of {len(names)} stages are done", f"{datetime.now():%H:%M:%S}"
         told = (
             f"Interrupted at {when}: {state}. mrstrain run resumes it." if interrupted
-            else f"In progress, at {when}: {state}, about {duration(left_s)} left. This page is updated every "
-            "minute and reloads itself. If the time above is older, the run was killed; mrstrain run resumes it."
+            else f"In progress, at {when}: {state}, about {duration(left_s)} left. This page is updated every minute "
+            "and reloads itself. If that time is some minutes ago, the run was killed; mrstrain run resumes it."
         )  # fmt: skip
         write_page_in_progress(self.path, self.study, names, outcomes, under_way, told, ended=interrupted)
         self._show(outcomes[name] for load in self.study.loads if (name := f"register {load}") in outcomes)

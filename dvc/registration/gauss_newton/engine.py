@@ -22,10 +22,11 @@ from dvc.worker import Worker
 
 _UNLABELLED = 0.1  # of the body: more than that was never in a phantom
 _NOTE = (
-    "Strain may be discontinuous at the tissue interfaces of the label map. The bone of the rigid alignment is rigid; "
-    "its results are those of the preceding smooth spline. Labels that are off by more than a voxel degrade the "
-    "result: use --no-borders then. The whole motion is in transform.h5, as displacements at voxels. No elastix text "
-    "files are written, because elastix has no spline with discontinuities."
+    "Strain may be discontinuous at the tissue interfaces of the label map. The bone of the rigid alignment is "
+    "constrained to be rigid; its key results are those of the preceding smooth spline. If label boundaries are wrong "
+    "by more than a voxel, use --no-borders (study file: borders = false). The whole motion, that of the bone "
+    "included, is in transform.h5, as displacements at voxels. No elastix text files are written, because elastix has "
+    "no spline with discontinuities."
 )
 
 

@@ -230,7 +230,10 @@ def test_a_repeat_scan_has_what_applies_to_it_alone(tiny_pair, measured):
     assert repeat.sigma is None
     beneath = [[name for name, _ in one.drawings()["strain"].beneath] for one in (loaded, repeat)]
     assert beneath == [["unloaded", "loaded, registered"], ["unloaded", "repeat, registered"]]
-    assert repeat.error_bars.as_dict() == {"known": False, "reason": "A repeat scan has none: its strain is the error."}
+    assert repeat.error_bars.as_dict() == {
+        "known": False,
+        "reason": "A repeat scan has no error bars: all of its apparent strain is error.",
+    }
     assert any("Noise floor" in str(row[0]) for row in sections[1].tables[0].rows)
 
 

@@ -173,7 +173,7 @@ def test_signs_of_other_inputs_are_told_and_those_of_the_measurement_are_not_tak
     assert of_model in told
     assert of_measurement not in told
     sound = rows(credibility_section(held(folders, comparison=comparison("t"))), "Credibility factors")[FACTORS[9]]
-    assert "no sign of another place, unit or frame" in sound[0]
+    assert "no check found another position, unit or frame" in sound[0]
 
 
 def test_a_sign_that_two_loads_share_is_told_once(tmp_path: Path) -> None:

@@ -125,9 +125,10 @@ def test_figures_and_papers_are_those_of_the_records(tmp_path: Path) -> None:
         "Load1 and Load2: The loaded image was aligned with the unloaded one rigidly on the bone",
         "itk-elastix 0.1.2", "mrstrain 9.8.7", "control points every 4.5 mm",
         "1000, 1000, 1000, 500 iterations of 5000",
-        "metric AdvancedNormalizedCorrelation", "seed 5", "pytetwild 6.7", "edges of 2.5 mm",
+        "metric AdvancedNormalizedCorrelation", "seed 5", "pytetwild 6.7", "requested edge length 2.5 mm",
         "trebbi: Set of trebbi (fat: Ogden, mu0 10.54 kPa)", "Load1 140 N normal, 0 N shear", "ansys (csv)",
-        "1234 tetrahedra", "from 0.2 to 0.5", "tissue above 0.2, 0.3 and 0.5", "A study of 3 heels.", "compared without intervals",
+        "1234 tetrahedra", "from 0.2 to 0.5", "tissue above 0.2, 0.3 and 0.5", "A study of 3 heels.",
+        "compared without intervals",
     ):  # fmt: skip
         assert said in text, said
     for paper in (

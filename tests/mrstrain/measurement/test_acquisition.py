@@ -59,7 +59,7 @@ def test_each_value_has_its_source_and_what_nobody_tells_is_not_given(tmp_path: 
         "median 0.0147, 95th percentile 0.0317; MAER 0.0065, SDER 0.0038", "repeat scan",
     )  # fmt: skip
     assert rows["Control point spacing of the displacement, mm"] == ("3.2 x 3.2 x 3.2", "registration")
-    assert rows["Regularisation, weights"][0] == "bending 3 1/mm, volume 300 1/mm³, rigidity 1000 1/mm³"
+    assert rows["Regularisation weights"][0] == "bending 3 1/mm, volume 300 1/mm³, rigidity 1000 1/mm³"
     assert rows["Spatial resolution of the strain"] == (NOT_GIVEN, "")
 
 

@@ -156,7 +156,7 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     assert float(fat["true_p95"]) == pytest.approx(np.percentile(StrainField.from_gradient(H).max_shear, 95), rel=1e-4)
     report = tmp_path / "demo" / "results" / "report.html"
     assert shown.lines[-1] == f"Report: {report}"
-    assert "Error against the truth" in report.read_text()
+    assert "Measurement error (phantom with known strain)" in report.read_text()
     before = (tmp_path / "demo" / "error.csv").read_bytes()
     again = demonstration.demo(tmp_path / "demo", seed=3, on_report=pages.append)
     assert again.lines == shown.lines  # nothing is done again

@@ -173,7 +173,7 @@ def test_no_figure_of_the_report_is_a_negative_zero(study: Study) -> None:
 
 
 def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_does(study: Study) -> None:
-    assert "Error against the truth" not in page_of(study, ended(study, register_Load1=SOUND))
+    assert "Measurement error (phantom with known strain)" not in page_of(study, ended(study, register_Load1=SOUND))
     ledger = Ledger(study.out, study.place)
     stages = {stage.name: stage for stage in plan(study)}
     for load in ("Load1", "Load2"):
@@ -185,7 +185,7 @@ def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_
     )
     report(study)  # what `run --report-only` does
     page = (study.out / "report.html").read_text()
-    assert "Error against the truth" in page
+    assert "Measurement error (phantom with known strain)" in page
     assert "0.0123" in page
     assert "0.0456" in page
     ledger.keep(stages["register Load2"], "", {}, SOUND, 1.0)  # made anew: the error of what was before is no longer so
