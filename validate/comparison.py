@@ -110,8 +110,8 @@ class Comparison:
     def _repr_html_(self) -> str:
         """For a notebook: the best match, the areas of all soft tissue, and the curves."""
         loads = list(self.coverage_ml)
-        head = ("model", "rank", *loads, *(["all loads"] if len(loads) > 1 else []))
-        rows = tuple(row[: len(head)] for row in area_rows(self.areas, self.ranking, loads))
+        columns = [*([ALL_LOADS] if len(loads) > 1 else []), *loads]
+        head, rows = ("model", "rank", *columns), tuple(area_rows(self.areas, self.ranking, columns))
         low, high = self.strains
         interval = " (95 % interval)" if any(np.isfinite(area.low_ml) for area in self.areas) else ""
         title = f"Area between strain-volume curves, maximum shear strain {low:g} to {high:g}, mL{interval}"

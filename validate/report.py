@@ -222,22 +222,23 @@ def _ranks(ranking: Ranking, model: str) -> str:
 
 
 def area_rows(areas: Iterable[Area], ranking: Ranking, loads: Sequence[str]) -> list[tuple[str, ...]]:
-    """Name, rank, and areas of all soft tissue under each load and over all, of each model; `NOTHING` comes last."""
+    """Name, rank, and areas of all soft tissue under the loads or `ALL_LOADS`, of each model; `NOTHING` comes last."""
     cells = {(a.model, a.load): shown(a) for a in (*ranking.areas, ranking.nothing, *areas) if a.tissue == ALL}
     models = [name for name in dict.fromkeys(model for model, _ in cells) if name != NOTHING]
     return [
-        (name, _ranks(ranking, name), *(cells.get((name, load), "–") for load in (*loads, ALL_LOADS)))
-        for name in (*models, NOTHING)
+        (name, _ranks(ranking, name), *(cells.get((name, load), "–") for load in loads)) for name in (*models, NOTHING)
     ]
 
 
 def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
     low, high = loads[0].criteria.strains
     levelled = any(area.levelled for area in ranking.areas)
-    *rows, nothing = area_rows([a for one in loads for a in one.areas], ranking, [one.load for one in loads])
+    *rows, nothing = area_rows(
+        [a for one in loads for a in one.areas], ranking, [ALL_LOADS, *(one.load for one in loads)]
+    )
     return Table(
         f"Area between measured and simulated strain-volume curves, all soft tissue, strain {low:g} to {high:g}, mL",
-        ("model", "rank", *(_head(one) for one in loads), "all loads"),
+        ("model", "rank", ALL_LOADS, *(_head(one) for one in loads)),
         tuple(rows),
         "Best model over all loads first; a rank such as 1–2 means that models are not distinguishable. If the "
         "measurement uncertainty is known, areas are estimates with noise and smoothing removed, with 95 % intervals. "
