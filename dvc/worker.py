@@ -198,7 +198,8 @@ class Worker(AbstractContextManager["Worker", None]):
         """End the child process."""
         with self._lock:
             if self._executor is not None:
-                self._executor.shutdown(wait=True)
+                # loky takes the last word: without it, a child that `kill` has not ended yet would be waited for.
+                self._executor.shutdown(wait=True, kill_workers=self._killed)
                 self._executor = None
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:

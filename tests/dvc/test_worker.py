@@ -266,6 +266,16 @@ def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():
     worker.close()
 
 
+def test_an_interrupt_while_the_process_starts_does_not_wait_for_its_task():
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), Worker(threads=1) as worker:
+        executor = worker._running()
+        worker._submitted(executor, time.sleep, LONG_S)
+        raise KeyboardInterrupt
+    assert executor._flags.kill_workers  # which one that had just begun to wait for a task would outlive
+    assert time.monotonic() - began < AT_ONCE_S
+
+
 def test_an_interrupt_leaves_no_process_and_the_next_task_has_a_fresh_one(monkeypatch):
     """As in a notebook, where the worker is still there after it."""
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)
