@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_typ
 import numpy as np
 
 from dvc.errors import InputError
+from dvc.file_names import refuse_path
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -70,6 +71,19 @@ def check(name: str, value: object, hint: Any) -> None:
     if (other := _misfit(name, value, hint)) is not None:
         named, given, wanted = other
         raise InputError(f"{named} must be {_words(wanted)}; got {shown(given)}.")
+    if "Path" in str(hint):
+        _refuse_paths(value)
+
+
+def _refuse_paths(value: object) -> None:
+    """InputError for a path that no file can have, among values that may be paths."""
+    if isinstance(value, str | PathLike):
+        refuse_path(value)
+    elif isinstance(value, Mapping):
+        _refuse_paths(list(value.values()))
+    elif isinstance(value, list | tuple):
+        for each in value:
+            _refuse_paths(each)
 
 
 def shown(value: object) -> str:

@@ -1,11 +1,13 @@
 """Names of loads, material sets and models, which become names of files: none leads out of the folder of results."""
 
+import os
 import unicodedata
 from collections.abc import Iterable
 
 from dvc.errors import InputError
 
 _MOST_BYTES = 200  # file systems take 255, of which endings need some
+_MOST_OF_A_PATH = 255
 _DEVICES = {"con", "prn", "aux", "nul"} | {f"{port}{n}" for port in ("com", "lpt") for n in "0123456789¹²³"}
 
 
@@ -23,6 +25,27 @@ def as_file_name(text: str) -> str:
     if len(text.encode(errors="replace")) > _MOST_BYTES:
         raise ValueError(f"becomes the name of a folder: {_MOST_BYTES} bytes are the most")
     return text
+
+
+def refuse_path(path: str | os.PathLike[str]) -> None:
+    """InputError for a path that no file can have: with a null character, or a name of more than 255 bytes."""
+    text = os.fspath(path)
+    if "\0" in text:
+        raise InputError(f"{text!r} has a null character (\\u0000), which no path has. Type it again.")
+    longest = max((part for part in text.split(os.sep)), key=len)
+    if (size := len(os.fsencode(longest))) > _MOST_OF_A_PATH:
+        raise InputError(
+            f"{longest[:40]}...: a name of {size} bytes; file systems take {_MOST_OF_A_PATH}. Choose a shorter one."
+        )
+
+
+def is_utf8(path: os.PathLike[str]) -> bool:
+    """Whether a path can be written in UTF-8, as native libraries need it; one of an old file system may not be."""
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def one_spelling(name: str) -> str:

@@ -1,4 +1,4 @@
-"""JSON, CSV and npz files of our own, read whole: whatever is wrong with one is a ValueError.
+"""JSON, TOML, CSV and npz files of our own, read whole: whatever is wrong with one is a ValueError.
 
 The libraries below raise a dozen kinds of error on a damaged file, and take some damage for numbers.
 """
@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import math
+import tomllib
 import zipfile
 from pathlib import Path
 from typing import Any, NoReturn
@@ -22,14 +23,40 @@ def read_json(path: Path) -> dict[str, Any]:
     64 bits.
     """
     try:
-        told = json.loads(path.read_text(encoding="utf-8"), **_NUMBERS)
+        return parse_json(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError as wrong:
         raise ValueError(str(wrong)) from wrong  # whose repr would quote the whole file
+
+
+def parse_json(text: str) -> dict[str, Any]:
+    """The object that a text of JSON holds; ValueError as `read_json`."""
+    try:
+        told = json.loads(text, **_NUMBERS)
     except RecursionError as endless:
-        raise ValueError("brackets in brackets without end") from endless
+        raise ValueError(_NESTED) from endless
     if not isinstance(told, dict):
         raise ValueError(f"a {type(told).__name__}, not an object")
     return told
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables that a text of TOML holds.
+
+    ValueError for anything else, of which `tomllib.TOMLDecodeError` is one, and for whole numbers beyond 64 bits.
+    """
+    try:
+        told = tomllib.loads(text)
+    except RecursionError as endless:
+        raise ValueError(_NESTED) from endless
+    _refuse_large(told)
+    return told
+
+
+def _refuse_large(told: object) -> None:
+    if isinstance(told, int) and not -(2**63) <= told < 2**63:
+        raise ValueError("a whole number has more than 18 digits")
+    for each in told.values() if isinstance(told, dict) else told if isinstance(told, list) else ():
+        _refuse_large(each)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
@@ -47,6 +74,9 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         if len(row) != len(head):
             raise ValueError(f"{path.name}: row {number} has {len(row)} cells, but the header has {len(head)}")
     return [dict(zip(head, row, strict=True)) for row in rows]
+
+
+_NESTED = "it is nested too deeply"
 
 
 def _refused(word: str) -> NoReturn:

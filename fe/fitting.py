@@ -11,6 +11,7 @@ from scipy.stats import f as fisher, t as student
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError, few
+from dvc.file_names import refuse_path
 from dvc.tables import read_table
 from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL
 from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
@@ -58,6 +59,7 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
         If the file cannot be read, a column is missing or ambiguous, or a value is not a number (the message gives its
         line).
     """
+    refuse_path(path)
     columns, rows = read_table(Path(path))
     stress = [c for c in columns if c in _STRESS]
     if "stretch" not in columns or len(stress) != 1:

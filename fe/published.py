@@ -4,7 +4,6 @@ import difflib
 import inspect
 import json
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -13,7 +12,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from dvc.errors import InputError, few
-from dvc.file_names import refuse_as_file_name
+from dvc.file_names import refuse_as_file_name, refuse_path
+from dvc.own_files import parse_toml
 from dvc.tables import refuse_damaged_toml
 from fe.hyperelastic import OGDEN
 from fe.materials import MODES, Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
@@ -205,6 +205,7 @@ def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
         set and tissue.
     """
     try:
+        refuse_path(path)
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as failure:
         raise InputError(f"{path}: the material sets cannot be read ({failure}).") from failure
@@ -255,8 +256,8 @@ def _published() -> dict[str, MaterialSet]:
 
 def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
     try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as failure:
+        tables = parse_toml(text)
+    except ValueError as failure:
         raise InputError(f"{where}: not a TOML file: {failure}.") from failure
     refuse_damaged_toml(where, text, tables)
     sets = {}

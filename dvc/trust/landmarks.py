@@ -1,7 +1,6 @@
 """Landmark pairs: the same anatomical points marked by hand in the unloaded and the loaded image."""
 
 import csv
-import json
 import logging
 import math
 import os
@@ -13,6 +12,7 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
 from dvc.errors import ImageFileError, InputError, few
+from dvc.own_files import parse_json
 from dvc.tables import read_table, read_text, refuse_half_a_line
 
 _log = logging.getLogger(__name__)
@@ -148,7 +148,7 @@ def _slicer_points(path: Path) -> _Points:
 
 def _from_markups(path: Path) -> _Points:
     try:
-        (markup,) = json.loads(read_text(path))["markups"]
+        (markup,) = parse_json(read_text(path))["markups"]
         frame, unit = str(markup["coordinateSystem"]), markup.get("coordinateUnits", "mm")
         listed: list[dict[str, Any]] = list(markup["controlPoints"])
     except (ValueError, KeyError, TypeError) as error:

@@ -106,9 +106,9 @@ def main() -> None:
     except Exception as error:
         try:
             from dvc.errors import MrstrainError
-            from mrstrain.records.outcome import lack_of_machine
+            from mrstrain.records.outcome import lack_of_machine, wrong_path
 
-            message = str(error) if isinstance(error, MrstrainError) else lack_of_machine(error)
+            message = str(error) if isinstance(error, MrstrainError) else lack_of_machine(error) or wrong_path(error)
         except (MemoryError, SystemError, ImportError):  # for want of memory to load these
             message = "The memory ran out. Free memory or use fewer --workers."
         if not message:

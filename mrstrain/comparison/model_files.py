@@ -1,6 +1,5 @@
 """Files of the models by load, and the settings with which they are read: mesh, unit, frame."""
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from dvc.deformation.nodal import OnMesh
 from dvc.errors import ExtentError, InputError, few
 from dvc.file_names import clash
 from dvc.mesh import box_told
-from dvc.own_files import read_json
+from dvc.own_files import parse_toml, read_json
 from dvc.tables import refuse_damaged_toml
 from mrstrain.models.variant_files import VariantFolder
 from mrstrain.options.modelling import ModelReading
@@ -244,7 +243,7 @@ def _settings(place: Path) -> dict[str, Any]:
         return {}
     try:
         text = settings.read_text(encoding="utf-8")
-        content = tomllib.loads(text)
+        content = parse_toml(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{settings} is not a valid TOML file ({error}).") from error
     refuse_damaged_toml(settings, text, content)

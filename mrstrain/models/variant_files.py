@@ -2,13 +2,13 @@
 
 import json
 import os
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from dvc.errors import InputError
+from dvc.own_files import parse_toml
 from dvc.tables import refuse_damaged_toml
 from mrstrain.options.model import Options, Real
 
@@ -73,7 +73,7 @@ def variant_folders(places: Iterable[Path]) -> list[VariantFolder]:
 def _read(file: Path) -> VariantRecord:
     try:
         text = file.read_text(encoding="utf-8")
-        content: dict[str, Any] = tomllib.loads(text)
+        content = parse_toml(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a valid TOML file ({error}).") from error
     refuse_damaged_toml(file, text, content)

@@ -13,6 +13,8 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar, Union, get_args, get
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.fields import FieldInfo
 
+from dvc.file_names import refuse_path
+
 
 @dataclass(frozen=True, slots=True)
 class Cli:
@@ -61,16 +63,20 @@ class Options(BaseModel):
     def of(cls, given: Mapping[str, Any], called: Callable[[str], str] = str) -> Self:
         """The options given by name, the others by default.
 
-        ParameterError names each that cannot be used, as it is ``called`` where it was given, and why.
+        ParameterError names each that cannot be used, as it is ``called`` where it was given, and why; InputError a
+        path that no file can have.
         """
         try:
-            return cls(**given)
+            made = cls(**given)
         except ValidationError as wrong:
             from dvc.errors import ParameterError
 
             raise ParameterError(
                 " ".join(f"{called(str(e['loc'][0]))}: {reason(e)}." for e in wrong.errors(include_url=False))
             ) from wrong
+        for path in made.paths:
+            refuse_path(path)
+        return made
 
     @classmethod
     def option(cls, name: str) -> str:

@@ -13,7 +13,7 @@ from dvc import Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import remove_partial
 from dvc.errors import InputError, OutputError
-from dvc.file_names import clash, refuse_as_file_name
+from dvc.file_names import clash, is_utf8, refuse_as_file_name
 from dvc.io.images.write import refuse_overwriting_inputs
 from dvc.io.result_folder import REPORT
 from dvc.measurement.subject import LabelsFromImage, plate_directions
@@ -188,6 +188,9 @@ def output_folder(out: Path) -> Iterator[None]:
 
 def make_output(out: Path) -> None:
     """Make the output folder, and refuse one that cannot be written to."""
+    if not is_utf8(out):  # native code that writes into it would end the process
+        name = str(out).encode(errors="backslashreplace").decode()
+        raise OutputError(f"{name}: the name of the output folder is not UTF-8. Choose another folder (out).")
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".mrstrain-probe"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dvc.memory import TOO_LITTLE_MEMORY, is_lack_of_memory
 
+_SHORT = 80  # characters of a path
 _OF_DISKS = (errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE)
 
 
@@ -40,6 +41,21 @@ def lack_of_machine(failure: BaseException) -> str:
     if isinstance(failure, OSError) and failure.errno in _OF_DISKS:
         what = f"{failure.filename or tempfile.gettempdir()}: {failure.strerror}"
         return f"{what}. Free disk space or change the permissions, then run it again."
+    return ""
+
+
+def wrong_path(failure: BaseException) -> str:
+    """What is wrong with a path that the system does not take, in a sentence; empty for any other failure.
+
+    >>> wrong_path(OSError(36, "File name too long", "/tmp/a"))
+    '/tmp/a: File name too long. Check this path.'
+    """
+    if isinstance(failure, OSError) and failure.errno in (errno.ENAMETOOLONG, errno.ELOOP) and failure.filename:
+        named = str(failure.filename)
+        short = named if len(named) <= _SHORT else f"{named[:_SHORT]}..."
+        return f"{short}: {failure.strerror}. Check this path."
+    if isinstance(failure, RuntimeError) and str(failure).startswith("Symlink loop from"):  # of pathlib
+        return f"{failure}: this link leads to itself. Check this path."
     return ""
 
 

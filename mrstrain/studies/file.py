@@ -11,8 +11,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
-from dvc.file_names import as_file_name, clash, one_spelling
+from dvc.file_names import as_file_name, clash, one_spelling, refuse_path
 from dvc.io.result_folder import REPEAT
+from dvc.own_files import parse_toml
 from dvc.tables import refuse_damaged_toml
 from mrstrain.options import modelling
 from mrstrain.options.acquisition import AcquisitionOptions
@@ -271,11 +272,12 @@ def read_study(path: Path | str | Study) -> Study:
     """
     if isinstance(path, Study):
         return path
+    refuse_path(path)
     place = Path(path)
     place = place / FILE if place.is_dir() else place
     try:
         text = place.read_text(encoding="utf-8")
-        told = tomllib.loads(text)
+        told = parse_toml(text)
     except FileNotFoundError as missing:
         raise InputError(f"{place}: there is no such study file; `mrstrain init FOLDER` writes one.") from missing
     except tomllib.TOMLDecodeError as error:

@@ -29,6 +29,7 @@ _LARGEST_LABEL = 2**31
 _NEEDED_OVERLAP = 0.5
 _POINTS_AT_ONCE = 1 << 20
 _LABEL_COLUMNS = ("label", "value", "index", "id")
+_LABEL = "[0-9]{1,18}"
 _NAME_COLUMNS = ("name", "structure", "label")  # "label" may head the names beside another column of numbers
 
 _OnGrid = TypeVar("_OnGrid", Mask, LabelMap)
@@ -272,7 +273,7 @@ def _segment_names(path: Path) -> dict[int, str]:
     return {
         int(value): pairs.get(f"Segment{segment[1]}_Name", f"label-{value.strip()}").strip()
         for key, value in pairs.items()
-        if (segment := re.fullmatch(r"Segment(\d+)_LabelValue", key)) and value.strip().isdigit()
+        if (segment := re.fullmatch(r"Segment(\d+)_LabelValue", key)) and re.fullmatch(_LABEL, value.strip())
     }
 
 
@@ -282,10 +283,10 @@ def _csv_names(columns: list[str], rows: list[tuple[int, list[str]]]) -> list[tu
     label = next((columns.index(c) for c in _LABEL_COLUMNS if c in columns and columns.index(c) != name), None)
     if name is None or label is None:
         return []
-    return [(int(row[label]), row[name]) if row[label].isdecimal() else None for _, row in rows]
+    return [(int(row[label]), row[name]) if re.fullmatch(_LABEL, row[label]) else None for _, row in rows]
 
 
 def _table_name(line: str) -> tuple[int, str] | None:
-    match = re.fullmatch(r'([0-9]+)(?:\s+[\d.]+){6}\s+"(.*)"', line)  # ITK-SNAP
-    match = match or re.fullmatch(r"([0-9]+)\s+(\S.*?)(?:\s+[\d.]+){4}", line)  # Slicer
+    match = re.fullmatch(rf'({_LABEL})(?:\s+[\d.]+){{6}}\s+"(.*)"', line)  # ITK-SNAP
+    match = match or re.fullmatch(rf"({_LABEL})\s+(\S.*?)(?:\s+[\d.]+){{4}}", line)  # Slicer
     return (int(match[1]), match[2].strip()) if match else None

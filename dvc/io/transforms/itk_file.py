@@ -19,6 +19,7 @@ from dvc.arrays import FloatArray, numbers
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
 from dvc.errors import InputError, WorkerError
+from dvc.file_names import is_utf8
 from dvc.images.itk_image import from_sitk as image_from_sitk
 from dvc.worker import Worker
 
@@ -53,6 +54,8 @@ def is_itk_transform(path: Path) -> bool:
 def read_itk_transform(path: Path) -> Deformation:
     """Read a file of ITK; InputError if it is damaged, cut, not 3D or of a kind that is not supported."""
     try:
+        if not is_utf8(path):  # ITK would end the process
+            raise InputError("ITK opens only paths in UTF-8. Rename the folder or the file.")
         if path.suffix.lower() in _HDF5_SUFFIXES:
             _refuse_other_length(path)
             return _read_in_a_worker(path)
