@@ -71,7 +71,7 @@ class Subject:
     bone, tissue, labels : Mask, Mask, LabelMap or None
         On the reference grid.
     plate_normal : (3,)
-        The plate's outward unit normal, away from the body, LPS.
+        Unit direction from the body to the plate, LPS.
     axes : (3, 3) or None
         Columns: plate normal, shear direction, and their cross product; None without a shear direction.
     files : dict

@@ -184,7 +184,7 @@ class InSeries(Running):
     after: Path | None = None
     """Results folder of the load to start from."""
     allow_missing: Flag = False
-    """Leave NaN and infinite voxels out, instead of refusing the image."""
+    """Treat NaN and infinite voxels as missing, instead of rejecting the image."""
 
 
 @door
