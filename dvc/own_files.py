@@ -26,7 +26,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as wrong:
         raise ValueError(str(wrong)) from wrong  # whose repr would quote the whole file
     except RecursionError as endless:
-        raise ValueError("brackets in brackets without end") from endless
+        raise ValueError("its brackets are nested too deeply") from endless
     if not isinstance(told, dict):
         raise ValueError(f"a {type(told).__name__}, not an object")
     return told

@@ -57,7 +57,7 @@ class LabelsFromImage:
         notes = tuple(f"The label map was made from the image. {note}" for note in self.notes)
         if self.uncertain <= _MOST_UNCERTAIN:
             return notes
-        limits = f"use with care above {100 * _MOST_UNCERTAIN:.0f} %"
+        limits = f"limit: 'Use with care' above {100 * _MOST_UNCERTAIN:.0f} %"
         correct = "Look at its picture, and correct it with strokes or by hand."
         return (*notes, f"{self.told.removesuffix('.')} ({limits}). {correct}")
 
