@@ -19,11 +19,14 @@ def as_file_name(text: str) -> str:
     """
     unfit = any(c in '/\\:*?"<>|' or not c.isprintable() for c in text)
     if unfit or not text or text != text.strip() or "." in (text[0], text[-1]):
-        raise ValueError("becomes the name of a folder: no slash, colon or quotes, and no dot at the beginning or end")
+        raise ValueError(
+            "is used as a folder name: it must not be empty, contain slashes, colons, quotes or other special "
+            "characters, or begin or end with a dot or a space"
+        )
     if text.partition(".")[0].strip().casefold() in _DEVICES:
-        raise ValueError("is the name of a device on Windows: choose another")
+        raise ValueError("is reserved on Windows; choose another name")
     if len(text.encode(errors="replace")) > _MOST_BYTES:
-        raise ValueError(f"becomes the name of a folder: {_MOST_BYTES} bytes are the most")
+        raise ValueError(f"is too long for a folder name: at most {_MOST_BYTES} bytes")
     return text
 
 

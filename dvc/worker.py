@@ -124,7 +124,9 @@ class Worker(AbstractContextManager["Worker", None]):
                     executor.shutdown(wait=False, kill_workers=True)
                 elif not _is_answered(executor) and future is not None and not future.done():
                     self._abandon(executor)
-                    raise WorkerError(f"The memory ran out while {what}, beside its process. {TOO_LITTLE_MEMORY}")
+                    raise WorkerError(
+                        f"The memory ran out while {what}, in the process that waits for it. {TOO_LITTLE_MEMORY}"
+                    )
                 elif watch is not None:
                     watch()
 

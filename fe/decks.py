@@ -219,8 +219,8 @@ def _about(state: LoadState) -> tuple[str, ...]:
     return (
         f"Written by mrstrain: state at {state.reached:.0%} of {state.load.name}. Units mm, N, MPa; frame LPS.",
         "Bone is fixed; nodes on the plate are moved to their final positions. There is no contact and no force.",
-        f"Expected force on the plate along the normal force, the shear and their cross product: {force} N,",
-        "except for the difference between this element and the one of the simulation.",
+        f"Expected plate force along the normal force, the shear and their cross product: {force} N.",
+        "Small deviations come from the element type, which differs from that of the simulation.",
     )
 
 

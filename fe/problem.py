@@ -254,19 +254,22 @@ def _check_passed(plate: Plate, loads: Sequence[LoadStep], passed: Sequence[Load
     if twice := clash(load.name for load in (*passed, *loads)):  # states are kept by name
         raise InputError(f"Two loads are named {twice}; rename one of them.")
     if plate.turns:
-        raise InputError(f"{first.name} cannot pass other loads: its plate rotates, and each load releases it anew.")
+        raise InputError(
+            f"{first.name} cannot include other loads as intermediate states: its plate rotates, and is released anew "
+            "under each load."
+        )
     check_loads(plate, passed)
     way = [*passed, first]
     for load, following in pairwise(way):
         if load.sheared or load.target.displaced[0] != first.target.displaced[0]:
             raise InputError(
-                f"{first.name} cannot pass {load.name}, which has shear, or prescribes force where {first.name} "
-                "prescribes displacement, or the other way round."
+                f"{first.name} cannot include {load.name} as an intermediate state: {load.name} has shear, or one of "
+                "the two prescribes a force and the other a displacement."
             )
         if not load.target.values[0] < following.target.values[0]:
             raise InputError(
-                f"Loads that are passed must come in ascending order and be smaller than {first.name}: {load.name} is "
-                f"not smaller than {following.name}."
+                f"Intermediate loads must be in ascending order and smaller than {first.name}: {load.name} is not "
+                f"smaller than {following.name}."
             )
 
 

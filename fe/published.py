@@ -109,9 +109,9 @@ def _falling(name: str, materials: Materials) -> list[str]:
         low, high = ranges[mode]
         if low > _USED[0] or high < _USED[1]:
             found.append(
-                f"{name}: the material of {tissue} softens until its stress falls: it is stable only at {mode} "
-                f"stretches of {low:.2f} to {high:.2f}, and tissue under a plate is stretched by {_USED[0]:g} to "
-                f"{_USED[1]:g}. Check the signs of its parameters."
+                f"{name}: the material of {tissue} is stable (rising stress) only at {mode} stretches from {low:.2f} "
+                f"to {high:.2f}; tissue under a plate reaches stretches from {_USED[0]:g} to {_USED[1]:g}. Check the "
+                "signs of the parameters."
             )
     return found
 

@@ -83,13 +83,13 @@ def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials) -> f
 def why_not_reached(state: LoadState, materials: Materials) -> str:
     """How the search for the load ended, its likely cause and the next step."""
     least = float(state.strain.jacobian.min())
-    steps = ", even in small steps"
+    steps = ", even with small increments"
     if doubts("", materials):
-        steps = " (with an unusual material, small steps are not tried below half of the normal load)"
+        steps = " (a material is unusual: small increments are not tried below half of the normal load)"
     return (
-        f"no equilibrium was found beyond {state.reached:.0%} of the load{steps}; "
-        f"{'cells nearly folded' if least < CROWDED else 'tissue gave way'} (lowest det F {least:.2f}). "
-        "Lower the load, or check its unit and the material parameters."
+        f"no equilibrium was found beyond {100 * state.reached:.0f} % of the load{steps}; "
+        f"{'cells are nearly inverted' if least < CROWDED else 'the tissue probably became unstable'} "
+        f"(lowest det F {least:.2f}). Reduce the load, or check its unit and the material parameters."
     )
 
 

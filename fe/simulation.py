@@ -117,14 +117,17 @@ class Simulation:
         """Assumptions, and warnings about results."""
         reached = {state.load.name for state in self.states}
         notes = [
-            f"{row.load}: the material of {row.region} is not stable (Drucker) in {1.0 - row.stable_share:.1%} of its "
-            "volume."
+            f"{row.load}: the material of {row.region} violates Drucker stability in "
+            f"{100.0 * (1.0 - row.stable_share):.1f} % of its volume; do not trust strain there. Use another material "
+            "set or a smaller load."
             for row in self._unstable
         ]
         notes += [
-            f"{row.load}: {row.crowded_share:.1%} of {row.region} is compressed below det F {CROWDED:g}, where the "
-            "solver adds resistance so that cells do not fold. The material itself cannot carry a pressure above its "
-            f"bulk modulus ({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa)."
+            f"{row.load}: {100.0 * row.crowded_share:.1f} % of {row.region} is compressed below det F {CROWDED:g}. "
+            "There, the solver adds an artificial stiffness that prevents inverted cells, because this material cannot "
+            "carry a pressure above its bulk modulus "
+            f"({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa). Do not interpret strain in these "
+            "cells; use a higher Poisson's ratio or a lower load."
             for row in self.regions
             if row.crowded_share > _CROWD
         ]
@@ -144,8 +147,8 @@ class Simulation:
             if load.name not in reached
         ]
         notes += [
-            f"{state.load.name}: det F of nodal patches differs by over 5 % from that of the constitutive model in "
-            f"{share:.0%} of the volume; a finer mesh conserves volume better."
+            f"{state.load.name}: in {100.0 * share:.0f} % of the volume, the volume ratio of the mesh deviates by more "
+            "than 5 % from the one that the pressure and the bulk modulus give. A finer mesh reduces this error."
             for state in self.states
             if (share := self._share_off(state)) > _MUCH
         ]

@@ -147,6 +147,6 @@ def _moved(mesh: TetMesh, nodes: IntArray, normals: FloatArray, distance_mm: flo
             return TetMesh(points, mesh.cells, mesh.regions, mesh.facets), share
         share *= 0.5
     raise MrstrainError(
-        f"The mesh is too flat near an interface to move it by {abs(distance_mm):.3g} mm. Use a finer mesh, or set "
-        "labels_voxels = 0 in [uncertainty]."
+        f"Cells at a tissue interface are too flat to shift the interface by {abs(distance_mm):.3g} mm. Use a finer "
+        "mesh, or set labels_voxels = 0 in [uncertainty]."
     )

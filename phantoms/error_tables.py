@@ -73,7 +73,7 @@ def errors_by_tissue(
     """
     shape = labels.grid.shape
     if where.shape != shape:
-        raise GeometryError(f"The voxels to compare have shape {where.shape}, but the grid of the labels {shape}.")
+        raise GeometryError(f"The voxels to compare have shape {where.shape}, but the labels have shape {shape}.")
     inside = where & (labels.labels > 0)
     true_u, true_H = evaluate_on_grid(truth, labels.grid, inside)
     u, H = evaluate_on_grid(measured, labels.grid, inside)

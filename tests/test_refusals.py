@@ -177,7 +177,7 @@ REFUSED: list[tuple[int, Give, str, str, str]] = [  # row, what is given, and th
     (10, misspelt, "mine.txt", "no parameter 'NumberOfResolutionz'", "closest known name is 'NumberOfResolutions'"),
     (12, gap, "scan", "slices are missing", "Export the whole series"),
     (12, duplicate, "scan", "have the position of another slice", "keep only one"),
-    (12, two_series, "scan", "has 2 DICOM series", "dvc.write_image"),
+    (12, two_series, "scan", "contains 2 DICOM series", "dvc.write_image"),
     (13, terabytes, "a.nii", "100,582.8 GiB", "Crop or resample the image first"),
     (17, folder_in_a_file, "file/out", "results cannot be written here", "Choose another folder"),
     (17, lambda folder: refuse_touching_inputs(folder, ["Load1"], [folder / "Load1" / "a.nii"]), "Load1/a.nii",

@@ -114,7 +114,7 @@ def simulate_driven(
     if done == 0.0:
         raise MrstrainError(
             f"{load}: no equilibrium was found with the measured displacement on the surface, not even at the first "
-            "increment."
+            "increment. Check that the mesh fits the measurement (frame, bone), and has no flat cells at its surface."
         )
     return LoadState(
         load=LoadStep(load, float("nan")), reached=done, u_mm=state[:count].reshape(-1, 3),

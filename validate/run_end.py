@@ -46,12 +46,14 @@ def early_end(place: Path) -> EarlyEnd | None:
         if "E R R O R   T E R M I N A T I O N" in said:
             return EarlyEnd(f"ended with ERROR TERMINATION{at} ({log.name})", certain=True)
         if _BANNER in said:
-            return EarlyEnd(f"has no end in its log ({log.name}) and stopped{at}", certain=True)
+            return EarlyEnd(
+                f"did not finish: its log ({log.name}) has no termination message, and it stopped{at}", certain=True
+            )
         return _compared(time, whole, deck.name)
     if kind == ".frd":
         time, whole = time_in_frd(place), _calculix_time(place.with_suffix(".inp"))
         if whole is None and time is not None and not is_closed(place):
-            reason = f"has no end in its result (the line 9999) and stopped at time {time:g}"
+            reason = f"did not finish: its result has no last line (9999), and it stopped at time {time:g}"
             return EarlyEnd(reason, certain=True)
         return _compared(time, whole, f"{place.stem}.inp")
     return None

@@ -115,7 +115,7 @@ class BSpline:
         """
         where = frozen(where, np.bool_)
         if where.shape != grid.shape:
-            raise InputError(f"The mask 'where' has shape {where.shape}, but the grid {grid.shape}.")
+            raise InputError(f"The mask 'where' has shape {where.shape}, but the grid has shape {grid.shape}.")
         placed = indices_along_axes(self.control, grid)
         if placed is None:
             return self.evaluate(grid.points(where))

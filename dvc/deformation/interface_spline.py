@@ -309,7 +309,7 @@ class InterfaceSpline:
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid; order and errors as in `BSpline`."""
         if where.shape != grid.shape:
-            raise InputError(f"The mask 'where' has shape {where.shape}, but the grid {grid.shape}.")
+            raise InputError(f"The mask 'where' has shape {where.shape}, but the grid has shape {grid.shape}.")
         step = max(1, CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: memory stays that of the result
         found = []
         for start in range(0, grid.shape[0], step):

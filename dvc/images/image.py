@@ -170,9 +170,9 @@ class Grid:
     def __str__(self) -> str:
         """Shape, spacing and bounding box, for messages."""
         low, high = self.bounds_mm()
-        box = ", ".join(f"{a:z.1f} to {b:z.1f}" for a, b in zip(low, high, strict=True))
+        box = ", ".join(f"{axis} {a:z.1f} to {b:z.1f}" for axis, a, b in zip("xyz", low, high, strict=True))
         spacing = " x ".join(f"{s:.4g}" for s in self.spacing_mm)
-        return f"{' x '.join(map(str, self.shape))} voxels of {spacing} mm, box (LPS mm) {box}"
+        return f"{' x '.join(map(str, self.shape))} voxels of {spacing} mm; {box} mm (LPS)"
 
 
 def _on(grid: Grid, what: str, values: npt.ArrayLike, kind: type[_T]) -> npt.NDArray[_T]:
@@ -180,7 +180,7 @@ def _on(grid: Grid, what: str, values: npt.ArrayLike, kind: type[_T]) -> npt.NDA
     check("grid", grid, Grid)
     array = frozen(values, kind)
     if array.shape != grid.shape:
-        raise GeometryError(f"{what} has shape {array.shape}, but its grid {grid.shape}; they must be equal.")
+        raise GeometryError(f"{what} has shape {array.shape}, but its grid has shape {grid.shape}; they must be equal.")
     return array
 
 

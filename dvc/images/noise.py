@@ -44,7 +44,7 @@ def noise_in_air(image: Image, tissue: Mask) -> float | None:
     is empty or not on the image's grid. Parallel imaging has more noise in the tissue than this.
     """
     if not tissue.grid.same_as(image.grid) or not tissue.inside.any():
-        raise InputError("The noise estimate needs a tissue mask on the grid of the image that is not empty.")
+        raise InputError("The noise estimate needs a non-empty tissue mask on the grid of the image.")
     air = image.values[~image.missing & ~widened(tissue, _AIR_MM).inside]
     air = air[air > 0] if np.count_nonzero(air > 0) > 0.9 * max(air.size, 1) else air[:0]
     return float(np.median(air) / _RAYLEIGH_MEDIAN) if air.size >= _LEAST and np.ptp(air) > 0 else None

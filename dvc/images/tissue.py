@@ -37,8 +37,11 @@ def tissue_mask(image: Image) -> Mask:
     for plane in ((1, 2), (0, 2), (0, 1)):  # bone that runs out of the image is open in space only
         filled = _filled(filled, plane)
     if not 0.01 <= (share := float(filled.mean())) <= 0.99:
-        taken = f"the threshold selects {100 * share:.1f} % of the image"
-        raise InputError(f"No tissue mask could be made ({taken}). Pass one: tissue (--tissue on the command line).")
+        taken = f"the intensity threshold selects {100 * share:.1f} % of the image"
+        raise InputError(
+            f"The body could not be separated from air: {taken}. Give a mask of the body, `tissue` (--tissue on the "
+            "command line)."
+        )
     return Mask(image.grid, filled)
 
 

@@ -84,7 +84,7 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
     notes, ends = list[str](), _without_labels(image, body, spacing, reach)
     whole, fixed = body | ends, within(ends, spacing, reach)
     if ends.any():
-        notes.append("Boundaries are unchanged where the labels end inside tissue.")
+        notes.append("Where the label map ends inside tissue (truncation surface), boundaries were not corrected.")
     new_skin = skin
     if skin.any():
         near_bone = distance_transform_edt(~bones, sampling=spacing) <= reach if bones.any() else bones

@@ -94,8 +94,8 @@ def label_tissues(
     marked = {} if marks is None else dict(_regions(fit_mask(marks, grid, "marks")))
     if bone is None and not any(map(is_bones_name, marked)):
         raise InputError(
-            "Labels need a bone. Give its mask as bone (--bone), or a mark in it, such as 'calcaneus', as marks "
-            "(--marks)."
+            "A bone is needed to make a label map. Give its mask as `bone` (--bone on the command line), or strokes in "
+            "it, under the name of a bone such as calcaneus, as `marks` (--marks)."
         )
     known = np.zeros(grid.shape, dtype=bool) if bone is None else fit_mask(bone, grid, "bone").inside
     if known.any() and (count := int(known.sum())) < _LEAST_BONE:
@@ -109,8 +109,8 @@ def label_tissues(
         raise InputError("The bone leaves no soft tissue in the body. Check the masks.")
     if known.any() and (share := float(whole[known].mean())) < _LEAST_IN_BODY:
         raise InputError(
-            f"Only {share:.0%} of the bone is in the body. The mask of the bone (bone, --bone) was drawn on another "
-            "image, or that of the body (body; --tissue on the command line) lacks a part."
+            f"Only {100 * share:.0f} % of the mask of the bone is inside the body. Either it was drawn on another "
+            "image, or the mask of the body (--tissue on the command line) is incomplete. Check both."
         )
     whole = whole | known
     watch(0.1)
@@ -136,7 +136,10 @@ def label_tissues(
             "strokes; if fat is suppressed, give an image in which it is bright."
         )
     if "muscle" not in chance:
-        notes.append("One tissue was found below the skin: its brightness does not separate fat from muscle.")
+        notes.append(
+            "Fat and muscle could not be separated by intensity: only one tissue was found below the skin. Strokes in "
+            "both (--marks) may help."
+        )
     because = dict.fromkeys(outside, "they lie outside the body, or in the mask of the bone")
     because |= dict.fromkeys(set(marked) - set(chance), "the image does not show it as a tissue of its own")
     notes += [f"The strokes of {name} were not used: {because[name]}." for name in sorted(because)]

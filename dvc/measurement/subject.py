@@ -57,7 +57,7 @@ class LabelsFromImage:
         notes = tuple(f"The label map was made from the image. {note}" for note in self.notes)
         if self.uncertain <= _MOST_UNCERTAIN:
             return notes
-        limits = f"use with care above {100 * _MOST_UNCERTAIN:.0f} %"
+        limits = f"limit: 'Use with care' above {100 * _MOST_UNCERTAIN:.0f} %"
         correct = "Look at its picture, and correct it with strokes or by hand."
         return (*notes, f"{self.told.removesuffix('.')} ({limits}). {correct}")
 
@@ -71,7 +71,7 @@ class Subject:
     bone, tissue, labels : Mask, Mask, LabelMap or None
         On the reference grid.
     plate_normal : (3,)
-        The plate's outward unit normal, away from the body, LPS.
+        Unit direction from the body to the plate, LPS.
     axes : (3, 3) or None
         Columns: plate normal, shear direction, and their cross product; None without a shear direction.
     files : dict

@@ -115,7 +115,10 @@ class RigidFit:
         """
         motion = self._settled(start, self._levels, [np.ones(len(level.points), bool) for level in self._levels])
         if (moved_mm := apart_mm(motion, start, self._levels[0].points)) > _FARTHEST_MM:
-            raise RegistrationError(f"The rigid fit moved {moved_mm:.0f} mm away from its start.")
+            raise RegistrationError(
+                f"The rigid fit diverged: it moved {moved_mm:.0f} mm from its starting position. Check that both "
+                "images show the same body part."
+            )
         return motion
 
     def halves(self, near: RigidMotion) -> list[tuple[RigidMotion, RigidMotion]]:

@@ -12,7 +12,7 @@ from dvc.trust.plate_motion import displacement_along_normal, moves_away
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
 
-_NOISIER = " even at 1.5 times this noise"
+_NOISIER = " if it is exceeded at 1.5 times this noise, too"
 # Where a quantity lowers the verdict: use with care, do not trust. If the second limit is the lower, it must lie above.
 # Beside the limits: decimals and unit of the quantity in the sentence that tells of it.
 # The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
@@ -23,26 +23,29 @@ _NOISIER = " even at 1.5 times this noise"
 _LIMITS = {
     "similarity": (0.7, 0.45, 2, "",
         "The registered images agree poorly: local similarity {value} ({limits})."),
-    "unlikeness": (0.05, 0.09, 2, "", "The registered images differ by more than the noise measured in the air "
-        f"explains: local similarity is {{value}} too low ({{limits}}{_NOISIER}). Check that both images "
-        "show the same subject, scanned with the same protocol. Parallel imaging and filters change the noise in the "
-        "tissue."),
+    "unlikeness": (0.05, 0.09, 2, "", "The registered images differ more than their noise explains: local similarity "
+        "is {value} below the highest value that the noise measured in the air allows "
+        f"({{limits}}{_NOISIER}). Check that both images show the same subject, scanned with the same protocol. "
+        "Parallel imaging and filters change the noise in the tissue."),
     "offset": (0.07, 0.12, 0, "%", "The images differ by an offset in brightness, {value} of the tissue's brightness "
         f"({{limits}}{_NOISIER}). The registration takes it for motion. Scan both with the same protocol, or remove "
         "the offset from the images."),
     "voxel_mm": (2.0, 5.0, 1, " mm", "Slices are {value} apart ({limits}). Strain across slices is hardly resolved, "
         "and apparent strain appears where there is none."),
     "bone_shift_mm": (0.3, 0.8, 2, " mm",
-        "The bone, which is rigid, shows an apparent displacement of {value} (root mean square; {limits})."),
+        "The bone, which is rigid, shows an apparent displacement of {value} (root mean square; {limits}). Check that "
+        "the mask is that of the bone on the unloaded image."),
     "bone_shear_p95": (0.1, 0.25, 3, "", "The bone, which is rigid, shows an apparent maximum shear strain of {value} "
-        "(95th percentile; {limits})."),
-    "lowest_jacobian": (0.3, 0.0, 2, "",
-        "The lowest volume ratio is {value}: tissue is compressed to this fraction of its volume ({limits})."),
+        "(95th percentile; {limits}). Do not use the strain next to bone."),
+    "lowest_jacobian": (0.3, 0.0, 2, "", "The lowest volume ratio is {value}: tissue is compressed to this fraction of "
+        "its volume ({limits}). Look there, at LPS ({place}) mm; at the edge of the body it is seldom real."),
     "undefined_fraction": (0.15, 0.4, 0, "%", "{value} of the tissue has no result: the loaded image does not show it, "
-        "or the deformation does not cover it ({limits})."),
-    "landmark_error_mm": (1.0, 2.0, 2, " mm", "The median landmark error is {value} ({limits})."),
+        "or the deformation does not cover it ({limits}). Use a larger field of view, or a smaller mask of the body."),
+    "landmark_error_mm": (1.0, 2.0, 2, " mm", "The median landmark error is {value} ({limits}). Check those with "
+        "the largest errors: they may be misplaced."),
     "floor_shear_p95": (0.06, 0.15, 3, "", "The repeat scan, without strain, shows an apparent maximum shear strain of "
-        "{value} (95th percentile; {limits})."),
+        "{value} (95th percentile; {limits}). Interpret no strain below it; more averages or larger voxels "
+        "lower it."),
 }  # fmt: skip
 
 
@@ -130,14 +133,14 @@ def assess(
     if similarity is None:
         findings.append(Verdict("caution", ("No images were compared; the given deformation is not checked.",)))
     if quality.folded_voxels:
-        place, least = ", ".join(f"{c:z.1f}" for c in at), _apart(lowest, (0.0,), 2)
+        least = _apart(lowest, (0.0,), 2)
         folds = f"The deformation folds (det F <= 0) in {quality.folded_voxels} voxels; the lowest det F is {least}"
-        findings.append(Verdict("distrust", (f"{folds}, at LPS ({place}) mm.",)))
+        findings.append(Verdict("distrust", (f"{folds}, at LPS ({_place(at)}) mm.",)))
     if similarity is not None:
         findings += _unlike(similarity, quality, float(maps.grid.spacing_mm.max()))
     for name in ("bone_shift_mm", "bone_shear_p95", "lowest_jacobian", "undefined_fraction"):
         if np.isfinite(value := getattr(quality, name)):
-            findings += _judged(name, value)
+            findings += _judged(name, value, place=_place(at))
     findings += _judged("landmark_error_mm", quality.landmarks["median_mm"])
     if floor is not None:
         findings += _judged("floor_shear_p95", floor.max_shear_p95)
@@ -180,7 +183,11 @@ def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[V
     return findings
 
 
-def _judged(name: str, value: float, distrusted: bool | None = None) -> list[Verdict]:
+def _place(at_mm: tuple[float, float, float]) -> str:
+    return ", ".join(f"{c:z.1f}" for c in at_mm)
+
+
+def _judged(name: str, value: float, distrusted: bool | None = None, place: str = "") -> list[Verdict]:
     """A quantity beside its limits: a finding, or none. ``distrusted``: decided by more than the second limit."""
     care, distrust, decimals, unit, sentence = _LIMITS[name]
     falling = care > distrust
@@ -191,9 +198,10 @@ def _judged(name: str, value: float, distrusted: bool | None = None) -> list[Ver
         distrusted = not value >= distrust if falling else value > distrust
     scale, side = 100.0 if unit == "%" else 1.0, "below" if falling else "above"
     near = [limit * scale for limit in (care, distrust)]
-    limits = f"use with care {side} {near[0]:g}{unit}, do not trust {side} {near[1]:g}{unit}"
+    limits = f"limits: 'Use with care' {side} {near[0]:g}{unit}, 'Do not trust' {side} {near[1]:g}{unit}"
     told = _apart(value * scale, near, decimals) + unit
-    return [Verdict("distrust" if distrusted else "caution", (sentence.format(value=told, limits=limits),))]
+    reason = sentence.format(value=told, limits=limits, place=place)
+    return [Verdict("distrust" if distrusted else "caution", (reason,))]
 
 
 def _apart(value: float, limits: Sequence[float], decimals: int) -> str:

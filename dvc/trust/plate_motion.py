@@ -57,7 +57,7 @@ def moves_away(displacement_mm: float) -> list[Verdict]:
         return []
     told = (
         f"Tissue under the bone moves away from it, by {displacement_mm:.1f} mm on average along the plate normal "
-        f"(use with care above {_MOST_MM:g} mm); a plate presses it towards the bone. Check that the unloaded and the "
-        "loaded image are not swapped, and that plate_normal points away from the body."
+        f"(limit: 'Use with care' above {_MOST_MM:g} mm); a plate presses it towards the bone. Check that the "
+        "unloaded and the loaded image are not swapped, and that plate_normal points away from the body."
     )
     return [Verdict("caution", (told,))]

@@ -73,7 +73,8 @@ def region_statistics(labels: LabelMap, values: Mapping[str, npt.NDArray[np.floa
     for quantity, array in values.items():
         if array.shape != labels.grid.shape:
             raise GeometryError(
-                f"'{quantity}' has shape {array.shape}, but the label map {labels.grid.shape}. Use the same grid."
+                f"'{quantity}' has shape {array.shape}, but the label map has shape {labels.grid.shape}. Use "
+                "the same grid."
             )
         if infinite := int(np.count_nonzero(np.isinf(array))):
             raise InputError(f"'{quantity}' has {infinite} infinite values; set them to NaN (missing).")

@@ -23,8 +23,8 @@ _GREETING = """\
 mrstrain measures strain inside soft tissue from pairs of MR images, and compares finite-element
 models with it.
 
-  mrstrain demo       see it work: a phantom heel, from images to report, in a few minutes
-  mrstrain init       set up a study of your own images and models, which mrstrain run then computes
+  mrstrain demo       see it work: a heel phantom, from images to report, in a few minutes
+  mrstrain init       set up a study with your own images and models; mrstrain run then computes it
   mrstrain register   measure strain between two of your images, unloaded and loaded, without a study
 
 mrstrain --help lists all commands, and mrstrain COMMAND --help the options of one."""

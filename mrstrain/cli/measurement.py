@@ -11,6 +11,7 @@ from mrstrain.cli.lines import say
 from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
 from mrstrain.options.measurement import (
     BoneAndBody,
+    ExistingFiles,
     GivenLabels,
     Marks,
     MeshAndAxes,
@@ -47,7 +48,8 @@ def label(
 ) -> None:  # fmt: skip
     """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few strokes.
 
-    With --from and --labels, transfer another subject's label map; with --labels alone, correct one of this image.
+    With --from and --labels, transfer the label map of another subject; with --labels alone, correct an existing label
+    map of this image.
     """
     from dvc.errors import InputError
 
@@ -91,9 +93,9 @@ def strain(
     deformation: Annotated[
         Path, typer.Argument(help="elastix transform .txt, ITK transform (.h5, .tfm), or a displacement image.")
     ],
-    out: Out, subject_files: SubjectFiles, onto: MeshAndAxes, frame: FieldFrame = None,
+    out: Out, subject_files: ExistingFiles, onto: MeshAndAxes, frame: FieldFrame = None,
 ) -> None:  # fmt: skip
-    """Compute strain maps from a transform or displacement field of any tool."""
+    """Compute strain maps from a transform or displacement field of any registration program."""
     given = mrstrain.strain.with_options
     tell(given(reference, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto))
 
@@ -108,7 +110,7 @@ def phantom(
     snr: Annotated[float, typer.Option(help="Signal of fat over the standard deviation of the noise.")] = 25.0,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False, *, shape: HeelShape,
 ) -> None:  # fmt: skip
-    """Make images of a phantom heel under Load0 to Load4, with exactly known strain."""
+    """Make images of a heel phantom, unloaded (Load0) and under loads (Load1 to Load4), with exactly known strain."""
     from phantoms import LOADS
 
     edges = (spacing, spacing, spacing if slice_spacing is None else slice_spacing)
@@ -123,9 +125,12 @@ def twin(
     load0: Annotated[Path, typer.Argument(help="Your own unloaded image.")],
     deformation: Annotated[
         Path,
-        typer.Argument(help="The whole motion: elastix .txt, ITK transform (.h5, .tfm), or a displacement image."),
+        typer.Argument(
+            help="Total deformation to apply, including the rigid motion of the bone: elastix .txt, ITK transform "
+            "(.h5, .tfm), or a displacement image."
+        ),
     ],
-    out: Out, subject_files: SubjectFiles, frame: FieldFrame = None,
+    out: Out, subject_files: ExistingFiles, frame: FieldFrame = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and bias field.")] = 1,
 ) -> None:  # fmt: skip
     """Make a synthetic warp of your own unloaded image, with its exact strain, to test a registration."""
@@ -137,8 +142,8 @@ def accuracy(
     preset: Annotated[
         list[str] | None,
         typer.Option(
-            help="gauss-newton, gauss-newton-borders (with labels), an elastix preset, or an elastix parameter file "
-            "(.txt). Default: gauss-newton. Repeat for several."
+            help="Engine or elastix preset to test: gauss-newton, gauss-newton-borders (with labels), heel-mr, or an "
+            "elastix parameter file (.txt). Default: gauss-newton. Repeat for several."
         ),
     ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Voxel edge, mm. Repeat for several.")] = None,
@@ -147,8 +152,10 @@ def accuracy(
     motion: Annotated[
         list[str] | None,
         typer.Option(
-            help="still, smooth, sliding, swelling, attached-Load1, attached-Load3, Load1 to Load4, or wave-L (L in "
-            "mm). Repeat for several."
+            help="Motion of the phantom's tissue: still (none, to measure the noise floor), smooth, sliding (of the "
+            "fat pad), swelling (the volume changes), Load1 to Load4, attached-Load1, attached-Load3 (tissue attached "
+            "to bone), or wave-L (shear wave, wavelength L in mm). Default: all but swelling, and eight waves. Repeat "
+            "for several."
         ),
     ] = None,
     seed: Annotated[
@@ -162,9 +169,9 @@ def accuracy(
 ) -> None:
     """Measure the error of an engine or preset on phantoms, by tissue, position and strain; also noise and resolution.
 
-    An interrupted study resumes. Default: 130 registrations with gauss-newton, nine motions and eight waves; voxels
-    of 0.8 mm at SNR 25, 12 and 50, and of 1.2 mm and 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr, only
-    the conditions given are measured. If only one of the two is given, the other is 0.8 mm or 25.
+    By default 130 registrations with gauss-newton: nine motions and eight waves, each with voxels of 0.8 mm at SNR
+    25, 12 and 50, and with voxels of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. --spacing and --snr replace these
+    conditions: without --spacing, voxels are then 0.8 mm; without --snr, the SNR is 25. An interrupted run resumes.
     """
     from dvc.registration.engines import DEFAULT
     from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES

@@ -19,8 +19,9 @@ Measured = Annotated[
 Loads = Annotated[
     list[str] | None,
     typer.Option(
-        help="NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N, or plate displacements with mm after the number. "
-        "Default: the four loads of the published experiment. Repeat for several.",
+        help="NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N (Load3=15,45), or plate displacements with the unit mm "
+        "(Load3=15,8mm). Default: the published loads Load1=140, Load2=15, Load3=15,45 and Load4=15,12. Repeat for "
+        "several.",
         rich_help_panel="Model",
     ),
 ]
@@ -39,7 +40,10 @@ def mesh(
     labelling: modelling.Labelling,
     meshing: modelling.Meshing,
 ) -> None:
-    """Mesh the soft tissues of a label map with tetrahedra, with named tissues and surface sets (bone, skin, cut)."""
+    """Mesh the soft tissues of a label map with tetrahedra, with named tissues and surface sets.
+
+    The surface sets are bone, skin, and cut (the truncation surface).
+    """
     from mrstrain.records.progress import live
 
     with live() as progress:
@@ -54,7 +58,10 @@ def simulate(
     simulation: modelling.SimulationOptions, plate_options: modelling.PlateOptions,
     coordinates: modelling.MeshCoordinates, cores: Cores, load: Loads = None,
 ) -> None:  # fmt: skip
-    """Simulate a rigid plate that presses and shears soft tissue on fixed bone; gives displacement, strain, stress."""
+    """Simulate the compression and shear of soft tissue between fixed bone and a rigid plate.
+
+    Results are displacement, strain and stress.
+    """
     from mrstrain.models.simulate import loads_named
 
     carry_out(
@@ -82,8 +89,8 @@ def compare(
     variants: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of a variant (results of a model with one input changed, and a variant.toml), or of several "
-            "variants. They give the input uncertainty. Repeat for several.",
+            help="Results of a model with one input changed (a folder with a variant.toml), or a folder of such "
+            "folders; used to compute the input uncertainty. Repeat for several.",
             rich_help_panel="Model",
         ),
     ] = None,
@@ -103,7 +110,7 @@ def drive(
     mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra; its surface set 'bone' is fixed.")], dvc: Measured,
     out: Out, material: modelling.MaterialSets, coordinates: modelling.MeshCoordinates,
 ) -> None:  # fmt: skip
-    """Simulate with measured boundary conditions, so that material sets are compared without the plate."""
+    """Simulate with measured boundary conditions, to compare material sets independently of the plate contact."""
     carry_out(mrstrain.drive.with_options, mesh, dvc, out=out, material=material, coordinates=coordinates)
 
 
@@ -137,7 +144,11 @@ def level(
 def converge(
     labels: LabelMap, out: Out,
     edge_mm: Annotated[
-        list[float], typer.Option(help="Edge length, mm. Repeat for three or more.", rich_help_panel="Model")
+        list[float],
+        typer.Option(
+            help="Edge length, mm. Give at least three: --edge-mm 4 --edge-mm 2.6 --edge-mm 1.9.",
+            rich_help_panel="Model",
+        ),
     ],
     labelling: modelling.Labelling, directions: modelling.Directions, followed: modelling.Followed, load: Loads = None,
     workers: Workers = None,

@@ -23,13 +23,13 @@ Out = Annotated[Path, typer.Option(help="Folder for the results; created if miss
 FieldFrame = Annotated[
     Frame | None,
     typer.Option(
-        help="Frame of the components of a displacement image, if no JSON file next to it gives the frame.",
+        help="Coordinate frame of the components of a displacement image, if no JSON file next to it states it.",
         rich_help_panel="Inputs",
     ),
 ]
 Workers = Annotated[
     int | None,
-    typer.Option(min=1, help="Jobs at the same time. Default: one per core.", rich_help_panel="Advanced"),
+    typer.Option(min=1, help="Number of parallel jobs. Default: one per core.", rich_help_panel="Advanced"),
 ]
 
 EXAMPLES = {

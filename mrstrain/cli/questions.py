@@ -20,7 +20,7 @@ def ask(inputs: StudyInputs, names: Sequence[str], picture: Path | str, *, read:
     ``read`` shows a question and gives a line.
     """
     typer.echo(f"Picture of the images found: {picture}")
-    typer.echo('Press Enter to accept the value in brackets; "later" leaves the line to be filled in.')
+    typer.echo("Press Enter to accept the value in brackets; with [later], fill it in yourself in study.toml.")
     given: dict[str, Any] = {}
     usual = Answers()
     try:
@@ -32,10 +32,10 @@ def ask(inputs: StudyInputs, names: Sequence[str], picture: Path | str, *, read:
             if pressed is not None:
                 forces[load] = pressed, _asked(f"{load}: shear force, N", "0", _number, read) or 0.0
         if inputs.loads:
-            normal = "Plate: outward normal, away from the body, LPS"
+            normal = "Direction from the body to the plate, LPS (x left, y posterior, z superior)"
             given["normal"] = _asked(normal, _words(usual.normal), _direction, read)
         if any(shear for _, shear in forces.values()):
-            shear = "Plate: direction of the shear force on the tissue, LPS"
+            shear = "Direction of the shear force on the tissue, LPS"
             given["shear_direction"] = _asked(shear, _words(usual.shear_direction), _direction, read)
     except EOFError:
         typer.echo("")
@@ -57,7 +57,8 @@ def _bone(inputs: StudyInputs, names: Sequence[str], read: Read) -> dict[str, ob
         raise ValueError(f"choose one of {', '.join([*names, *files])}")
 
     usual = inputs.bone_mask or next(iter(likely), "later")
-    told = _asked(f"Bone: its label ({', '.join(names) or 'none'}) or the file of its mask", usual, known, read)
+    label = f"Which label is the bone ({', '.join(names)}), or which file is its mask?"
+    told = _asked(label if names else "Which file is the mask of the bone?", usual, known, read)
     return told or ({"bone": usual} if usual in names else {})
 
 

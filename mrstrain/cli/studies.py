@@ -17,7 +17,8 @@ NoOpen = Annotated[
     bool,
     typer.Option(
         "--no-open",
-        help="Do not open the report in a browser. By default it opens with its first picture, if there is a display.",
+        help="Do not open the report in a browser. By default it opens as soon as the first result is ready, if there "
+        "is a display.",
         envvar="MRSTRAIN_NO_OPEN",
         rich_help_panel="Output",
     ),
@@ -80,7 +81,12 @@ def run(
         list[str] | None, typer.Option(help="Stages to run again, by kind or name. Repeat for several.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Skip the variants that give the input uncertainty of the models.")
+        bool,
+        typer.Option(
+            "--quick",
+            help="Skip the additional simulations (one input changed each) from which the input uncertainty of the "
+            "models is computed.",
+        ),
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be done.")] = False,
     report_only: Annotated[bool, typer.Option("--report-only", help="Only write the report again.")] = False,
@@ -132,8 +138,8 @@ def demo(
         bool,
         typer.Option(
             "--full",
-            help="Published size, about an hour: seven material sets, 75,000 cells. friedman stops early; the report "
-            "says so.",
+            help="Full size (about an hour): all seven published material sets on a mesh of about 75,000 cells. The "
+            "set friedman reaches its time limit before the full load.",
         ),
     ] = False,
     workers: Workers = None,

@@ -31,7 +31,7 @@ class Case:
     @classmethod
     def of(cls, measurement: "Measurement", folder: Path, record: Mapping[str, object]) -> Self:
         """Write a measurement, with its provenance; its folder is there whole or not at all."""
-        section, voxels = measurement.write(folder, record), str(measurement.maps.grid).partition(", box")[0]
+        section, voxels = measurement.write(folder, record), str(measurement.maps.grid).partition("; ")[0]
         return cls(folder, section, tuple(measurement.summary()), measurement.headline, voxels)
 
     @property

@@ -104,8 +104,14 @@ def _from_another(
 ) -> TissueLabels:  # fmt: skip
     """Labels of another subject, transferred to the image."""
     if drawn.labels is None:
-        what = "names are those of a label map" if drawn.from_image is None else "from_image needs its label map"
-        raise InputError(f"{what} (labels), which is not given. For marks, use mark_names.")
+        if drawn.from_image is None:
+            raise InputError(
+                "`names` is for the label map `labels`, which is not given (--names and --labels on the command line). "
+                "For the names of strokes, use `mark_names` (--mark-names)."
+            )
+        raise InputError(
+            "`from_image` needs the label map of that image, `labels` (--from and --labels on the command line)."
+        )
     if strokes.paths:
         raise InputError(
             "Give marks or another subject's labels, not both. If the labels are wrong somewhere, correct them by hand."

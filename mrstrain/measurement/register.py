@@ -154,11 +154,17 @@ def _hold(out: Path, stack: ExitStack) -> None:
 def _check_auto(files: SubjectFiles, cases: Sequence[str], scans: Scans) -> None:
     """InputError if the label map cannot be made from the image."""
     if files.bone is None:
-        raise InputError("With labels auto (--labels auto), give the mask of the bone, bone (--bone).")
+        raise InputError("labels auto also needs the mask of the bone: `bone` (--bone on the command line).")
     if files.names is not None or files.bone_label is not None:
-        raise InputError("names and bone_label are for a label map of your own, not for labels auto (--labels auto).")
+        raise InputError(
+            "`names` and `bone_label` need a label map of your own; they cannot be used with labels auto (on the "
+            "command line: --names, --bone-label, --labels auto)."
+        )
     if scans.allow_missing:
-        raise InputError("labels auto needs an image without missing voxels: not together with allow_missing.")
+        raise InputError(
+            "labels auto cannot be combined with `allow_missing` (--allow-missing on the command line): the image must "
+            "not have missing voxels."
+        )
     folder = Path(MADE_LABELS).parts[0]
     if folder in map(one_spelling, cases):
         raise InputError(f"A loaded image is named '{folder}', as the folder of the label map; rename it.")
@@ -184,7 +190,7 @@ class InSeries(Running):
     after: Path | None = None
     """Results folder of the load to start from."""
     allow_missing: Flag = False
-    """Leave NaN and infinite voxels out, instead of refusing the image."""
+    """Treat NaN and infinite voxels as missing, instead of rejecting the image."""
 
 
 @door

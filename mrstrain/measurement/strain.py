@@ -8,7 +8,7 @@ from dvc.errors import InputError
 from mrstrain.measurement.answer import measured_strain
 from mrstrain.measurement.case import Case, Series
 from mrstrain.options.door import door
-from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
+from mrstrain.options.measurement import ExistingFiles, Frame, MeshAndAxes
 from mrstrain.records.inputs import alone, case_names, output_folder, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
@@ -27,7 +27,7 @@ def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
 
 @door
 def strain(
-    reference: Path | str, deformation: Path | str, *, out: Path | str, subject_files: SubjectFiles,
+    reference: Path | str, deformation: Path | str, *, out: Path | str, subject_files: ExistingFiles,
     frame: Frame | None = None, onto: MeshAndAxes,
 ) -> Series:  # fmt: skip
     """Strain maps of a deformation that another tool measured.

@@ -52,7 +52,9 @@ class Converged:
         for row in self.rows:
             values, of = ", ".join(f"{v:.4g}" for v in row.values), row.limit
             tends = f"limit {of.limit:.4g} (order {of.order:.1f}), error of the finest mesh {of.error:+.1%}"
-            tends = tends if np.isfinite(of.limit) else "no limit can be determined"
+            tends = (
+                tends if np.isfinite(of.limit) else "no limit, because the values do not approach one; use finer meshes"
+            )
             lines.append(f"{row.load}, {row.quantity}: {values}; {tends}")
         return [*lines, f"Results: {self.out}"]
 

@@ -284,7 +284,7 @@ class _Files(fe.Observer):
             read = {load.name: self._read(load) for load in self._problem.passed}
             kept = {name: at for name, at in read.items() if at is not None and at.reached == 1.0}
         for name, checkpoint in kept.items():
-            self.log(f"{name}: resumed at {checkpoint.reached:.0%}, as solved before")
+            self.log(f"{name}: resumed from the checkpoint at {100 * checkpoint.reached:.0f} % of the load")
         return kept
 
     def _read(self, load: fe.LoadStep) -> fe.Checkpoint | None:

@@ -67,13 +67,3 @@ class CredibilityOptions(Options):
     """Level reached: relevance of the quantities of interest."""
     level_relevance_of_validation: Said = None
     """Level reached: relevance of the validation activities to the context of use."""
-
-    @property
-    def lacking(self) -> list[str]:
-        """Names of the fields that are not filled in; if no level is given, one entry stands for all levels."""
-        lacking = [name for name, value in self if value is None]
-        levels = [name for name in type(self).model_fields if name.startswith("level_")]
-        if not set(levels) <= set(lacking):
-            return lacking
-        others = f"{levels[0]} and the other {len(levels) - 1} levels"
-        return [*(name for name in lacking if name not in levels), others]

@@ -36,7 +36,7 @@ class BoneAndBody(Options):
     bone: Path | None = None
     """Mask of the bone on the unloaded image."""
     tissue: Path | None = None
-    """Mask of the body. Default: found by an intensity threshold."""
+    """Mask of the whole body part, bone included. Default: found by an intensity threshold."""
 
 
 class Marks(Options):
@@ -44,9 +44,15 @@ class Marks(Options):
 
     panel: ClassVar[str] = "Inputs"
 
-    marks: Path | None = None
-    """Label map of a few strokes in each tissue, from the strokes page, ITK-SNAP, 3D Slicer (.seg.nrrd) or any other
-    program."""
+    marks: Annotated[
+        Path | None,
+        Cli(
+            help="Strokes: a label map with a few voxels painted in each tissue, on the page written by --draw, in "
+            "ITK-SNAP, 3D Slicer (.seg.nrrd) or any other program."
+        ),
+    ] = None
+    """Strokes: a label map with a few voxels painted in each tissue, on the page written by draw_strokes, in ITK-SNAP,
+    3D Slicer (.seg.nrrd) or any other program."""
     mark_names: Path | None = None
     """Table of the names of the strokes: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon, 6
     other."""
@@ -75,9 +81,16 @@ class SubjectFiles(BoneAndBody):
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
-    """Label map of the tissues on the unloaded image. For register, auto makes it from the image and --bone."""
+    """Label map of the tissues on the unloaded image, or auto to make it from the image and --bone."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
+
+
+class ExistingFiles(SubjectFiles):
+    """What is known of the unloaded image, where no label map is made."""
+
+    labels: Path | None = None
+    """Label map of the tissues on the unloaded image."""
 
 
 class RecordedFiles(SubjectFiles):
@@ -86,7 +99,8 @@ class RecordedFiles(SubjectFiles):
     bone: Path | None = None
     """Mask of the bone on the unloaded image; the displacement is zero in it. Default: that of the measurement."""
     tissue: Path | None = None
-    """Mask of the body. Default: that of the measurement, or found by an intensity threshold."""
+    """Mask of the whole body part, bone included. Default: that of the measurement, or found by an intensity
+    threshold."""
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone. Default: that of the measurement, unless --labels is given."""
     labels: Path | None = None
@@ -107,9 +121,10 @@ class MeshAndAxes(Options):
     mesh_frame: Frame = "LPS"
     """Frame of the mesh coordinates."""
     plate_normal: Vector | None = None
-    """Outward normal of the plate, away from the body, LPS. Default: 0 0 -1 (inferior)."""
+    """Direction from the body to the plate, in LPS (x left, y posterior, z superior). Default: 0 0 -1 (inferior)."""
     shear_direction: Vector | None = None
-    """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior): adds strain in the plate's axes."""
+    """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior). If given, strain in the plate's axes
+    is also written."""
 
 
 def _known_engine(name: str) -> str:
@@ -128,10 +143,10 @@ class EngineOptions(Options):
     engine: Annotated[str, AfterValidator(_known_engine)] | None = None
     """Registration engine: gauss-newton or elastix. Default: gauss-newton; with --preset or --parameters, elastix."""
     borders: Flag | None = None
-    """gauss-newton with --labels: allow strain discontinuities at tissue interfaces. Default: on. Switch off for labels
-    that are off by more than a voxel."""
+    """gauss-newton with --labels: allow strain discontinuities at tissue interfaces. Default: on. Disable it if
+    label boundaries are wrong by more than one voxel."""
     preset: str | None = None
-    """Named elastix parameters, such as heel-mr."""
+    """Built-in elastix parameters: heel-mr."""
     parameters: tuple[Path, ...] = ()
     """Your own elastix parameter file, instead of --preset; each file is one stage."""
 
@@ -145,7 +160,7 @@ class RecordedEngine(EngineOptions):
     borders: Flag | None = None
     """gauss-newton with --labels: allow strain discontinuities at tissue interfaces. Default: as in the measurement."""
     preset: str | None = None
-    """Named elastix parameters, such as heel-mr. Default: those of the measurement, if it was made with elastix."""
+    """Built-in elastix parameters: heel-mr. Default: those of the measurement, if it was made with elastix."""
     parameters: tuple[Path, ...] = ()
     """Your own elastix parameter file, instead of --preset; each file is one stage. Default: those of the
     measurement."""
@@ -155,7 +170,7 @@ class RegistrationOptions(EngineOptions):
     """How loaded images are registered to the unloaded one."""
 
     align: Literal["bone", "image", "none"] = "bone"
-    """What the rigid alignment before the registration uses: the bone, the whole image, or nothing."""
+    """Rigid alignment before the non-rigid registration: on the bone, on the whole image, or none."""
     bending: Positive | None = None
     """gauss-newton: bending weight, 1/mm. Default: chosen for each pair by cross-validation."""
     volume: NotNegative | None = None
@@ -183,12 +198,12 @@ class Scans(Options):
     """Point pairs that measure the registration error: CSV (x0,y0,z0,x1,y1,z1 in mm LPS). Only with one loaded
     image."""
     start: Annotated[Path | None, Cli(panel="Registration")] = None
-    """Result of another tool to start from and refine: a transform or displacement image. Only with one loaded
-    image."""
+    """Result of another registration program to start from and refine: a transform or displacement image. Only with one
+    loaded image."""
     start_frame: Annotated[Frame | None, Cli(panel="Registration")] = None
-    """Frame of the components of --start, if its file does not give it."""
+    """Coordinate frame of the displacement components in --start, if the file does not state it."""
     allow_missing: Flag = False
-    """Leave NaN and infinite voxels out, instead of refusing the image."""
+    """Treat NaN and infinite voxels as missing, instead of rejecting the image."""
 
 
 class Threads(Options):
@@ -197,23 +212,23 @@ class Threads(Options):
     panel: ClassVar[str] = "Advanced"
 
     threads: Count | None = None
-    """Threads per worker. Default: all cores."""
+    """Number of threads. Default: all cores."""
 
 
 class Cores(Threads):
     """Number of threads, and of loads at the same time."""
 
     threads: Count | None = None
-    """Threads per worker. Default: the cores, divided among the loads computed at the same time."""
+    """Threads per worker. Default: the cores, divided among the loads computed in parallel."""
     workers: Count | None = None
-    """Loads computed at the same time. Default: as many as cores and loads allow."""
+    """Number of loads computed in parallel. Default: as many as cores and loads allow."""
 
 
 class Seeded(Threads):
     """Number of threads, and the seed of random numbers."""
 
     threads: Count | None = None
-    """Threads per worker. Default: all cores. elastix reproduces its results only with the same number of threads."""
+    """Number of threads. Default: all cores. elastix reproduces its results only with the same number of threads."""
     seed: Count = 1
     """Seed of all random numbers."""
 
@@ -222,7 +237,7 @@ class Running(Seeded, Cores):
     """Number of threads, loads at the same time, and the seed of random numbers."""
 
     threads: Count | None = None
-    """Threads per worker. Default: the cores, divided among the loads computed at the same time. elastix reproduces its
+    """Threads per worker. Default: the cores, divided among the loads computed in parallel. elastix reproduces its
     results only with the same number of threads."""
 
     def shares(self, loads: int) -> tuple[int, int]:

@@ -38,8 +38,8 @@ class ComparisonLabels(Options):
     """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, unless --labels is given."""
     bones: Annotated[Names, Cli("--bone")] = ()
     """Name of a bone label, which is not compared; slices in figures go through the lowest point of the first bone.
-    Default: the bone label of the measurement. With --labels, or without that label: every label that is named like
-    a bone."""
+    Default: the bone label of the measurement, if it had one and --labels is not given; otherwise every label that is
+    named like a bone, such as bone, calcaneus or talus."""
 
 
 class Finer(NamedTuple):
@@ -55,9 +55,10 @@ class Meshing(Options):
     panel: ClassVar[str] = "Model"
 
     edge_mm: Positive = 2.0
-    """Edge length of the cells, mm. Edges longer than about four voxels make little difference."""
+    """Edge length of the cells, mm. Above about four voxels of the label map, the mesh hardly gets coarser; for fewer
+    cells, use a coarser label map."""
     finer: Finer | None = None
-    """Region with an edge length of its own, mm, such as: skin 1."""
+    """Tissue with its own edge length, mm, such as: skin 1."""
     limit_s: Annotated[Positive, _limit("Stop meshing after this time, minutes.")] = 3600.0
     """Stop meshing after this time, s."""
 
@@ -79,9 +80,9 @@ class Directions(Options):
     panel: ClassVar[str] = "Model"
 
     plate_normal: Vector = (0.0, 0.0, -1.0)
-    """Outward normal of the plate, away from the body, LPS. Default: 0 0 -1 (inferior)."""
+    """Direction from the body to the plate, in LPS (x left, y posterior, z superior). Default: 0 0 -1 (inferior)."""
     shear_direction: Vector = (0.0, -1.0, 0.0)
-    """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior)."""
+    """Direction of the shear force on the tissue, LPS. Default: 0 -1 0 (anterior)."""
 
 
 class ComparisonDirections(Options):
@@ -90,7 +91,8 @@ class ComparisonDirections(Options):
     panel: ClassVar[str] = "Model"
 
     plate_normal: Vector | None = None
-    """Outward normal of the plate, away from the body, LPS. Default: that of the measurement, or 0 0 -1 (inferior)."""
+    """Direction from the body to the plate, in LPS (x left, y posterior, z superior). Default: that of the measurement,
+    or 0 0 -1 (inferior)."""
     shear_direction: Vector | None = None
     """Direction of the shear force on the tissue, LPS. Default: that of the measurement, or 0 -1 0 (anterior)."""
 
@@ -138,18 +140,18 @@ class Followed(Options):
     panel: ClassVar[str] = "Model"
 
     region: str = "fat"
-    """Region whose maximum shear strain is compared between meshes."""
+    """Tissue whose maximum shear strain is compared between meshes and extrapolated."""
     material: Annotated[str, Cli("--set")] = "trebbi"
-    """Material set of all meshes."""
+    """Material set used on all meshes."""
 
 
 class SimulationOptions(MaterialSets):
     """Which material sets are simulated, and how."""
 
     fixed: Annotated[Names, Cli("--fix")] = ()
-    """Surface set that is fixed in addition to the bone, such as cut."""
+    """Surface set that is fixed in addition to the bone, such as cut (the truncation surface)."""
     element: Literal["P1", "MINI", "P2"] = "P1"
-    """Finite element: P1 (linear, fast), MINI, or P2 (quadratic: more accurate, slow)."""
+    """Element: P1 (stabilised linear, fast), MINI (linear with bubble), or P2 (quadratic: more accurate, slow)."""
     decks: Annotated[Flag, Cli(panel="Output")] = False
     """Also write input files of each load for CalculiX and FEBio."""
     limit_s: Annotated[
@@ -190,9 +192,10 @@ class ComparisonOptions(Options):
     panel: ClassVar[str] = "Comparison"
 
     strains: Annotated[tuple[Real, Real], AfterValidator(_rising)] = (0.2, 0.5)
-    """Range of maximum shear strain over which the area metric is computed."""
+    """Range of maximum shear strain over which the area metric is computed. Default: 0.2 0.5."""
     thresholds: Path | None = None
-    """Strain thresholds of the clusters: CSV with the columns max_shear, source."""
+    """CSV with the strain thresholds above which location is compared: columns max_shear, source. Default: 0.2, 0.3 and
+    0.5."""
     least_ml: NotNegative = 0.1
     """Smallest volume of a cluster that counts, mL."""
 

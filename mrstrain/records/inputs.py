@@ -118,8 +118,8 @@ def case_names(loads: Sequence[Path]) -> list[str]:
         refuse_as_file_name("load", name, str(path))
     if twice := clash(names):
         raise InputError(
-            f"Each loaded image gets a results folder of its file name, but {twice} would be used twice. Rename the "
-            "files, or use different output folders (out)."
+            f"Results folders are named after the loaded images, and two would be named {twice}. Rename the files, or "
+            "use different output folders (out)."
         )
     return names
 

@@ -74,7 +74,7 @@ class MeasuredWith:
         found = cls.read(load.folder)
         if found is None:
             raise InputError(
-                f"{load.folder / PROVENANCE} is missing, so it is not known what was measured with. Give {instead}."
+                f"{load.folder / PROVENANCE} is missing, so the inputs of the measurement are unknown. Give {instead}."
             )
         return found
 
@@ -102,12 +102,12 @@ class MeasuredWith:
             changed = changed or place
         if changed is not None:
             raise InputError(
-                f"{self.path}: {changed} is not the {what} that was measured with, because its contents differ. "
-                f"Restore it, or give {instead}."
+                f"{self.path}: {changed} is not the {what} of the measurement (its contents differ). Restore the one "
+                f"that was used, or give {instead}."
             )
         raise InputError(
-            f"{self.path}: the {what} {name} that was measured with is neither near the results nor in the working "
-            f"directory. Give {instead}."
+            f"{self.path}: the {what} {name} of the measurement was found neither in the folders around the results "
+            f"nor in the working directory. Give {instead}."
         )
 
     def _places(self, name: str) -> Iterator[Path]:

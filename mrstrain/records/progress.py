@@ -1,6 +1,7 @@
 """Progress for people: live bars with the time left in a terminal, a line now and then in a pipe."""
 
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ _LINE_EVERY_S = 15.0
 _LINE_OF_ALL_EVERY_S = 60.0
 _LEAST_SHARE = 0.02
 _NONE_LEFT = "about 0 s left"
+_COUNTED = re.compile(r"(\d+) of \1\b.*")  # all that there are
 _MOST_SHARE = 0.99  # of what is not done: no line says 100 % while work goes on
 
 
@@ -136,11 +138,11 @@ def _lines_of_all() -> OnProgress:
             found.extend([f"{case}: {stage}"] if fraction >= 1.0 else [])
         elif found or fraction >= 1.0 or now - printed_at >= _LINE_OF_ALL_EVERY_S:
             printed_at = now
-            time_left = _left(now - began, fraction)
-            left = f", {time_left}" if time_left not in ("", _NONE_LEFT) else ""
-            after = f"{stage} after {duration(now - began)}"
-            ended = [f"finished: {after}"] if fraction >= 1.0 else []
-            told = [f"{line} ({after}{left})" for line in found or ([] if ended else ["all"])]
+            time_left, spent = _left(now - began, fraction), duration(now - began)
+            left = f", {time_left}" if time_left not in ("", _NONE_LEFT) and not _COUNTED.fullmatch(stage) else ""
+            after = f"{stage} after {spent}{left}"
+            ended = [f"finished after {spent}: {stage}"] if fraction >= 1.0 else []
+            told = [f"{line} ({after})" for line in found] or ([] if ended else [f"progress: {after}"])
             for line in (*told, *ended):
                 print(line, file=sys.stderr, flush=True)
             found.clear()

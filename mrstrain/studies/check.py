@@ -22,8 +22,9 @@ from fe import BONE, MaterialSet, Plate, check_loads, check_meshing, fixed_facet
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.acquisition import AcquisitionOptions
+from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.options.modelling import ModelReading
-from mrstrain.studies.costs import costs, mesh_given, sizes_of
+from mrstrain.studies.costs import CARE, costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
@@ -37,14 +38,22 @@ _P = ParamSpec("_P")
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Result of `check`: all problems that prevent the study from being run, and notes."""
+    """Result of `check`: all problems that prevent the study from being run, notes, and the next step without any."""
 
     wrong: tuple[str, ...]
     notes: tuple[str, ...]
+    next_step: str = ""
 
     def summary(self) -> list[str]:
         """Summary, a few lines."""
-        return [*self.notes, *(f"ERROR: {one}" for one in self.wrong)] or ["No problem was found."]
+        return [*self.notes, *([f"ERROR: {one}" for one in self.wrong] or [self._passed])]
+
+    @property
+    def _passed(self) -> str:
+        """The last line where nothing is wrong."""
+        count = sum(note.startswith(CARE) for note in self.notes)
+        warnings = f", but {count} warning{'s' if count > 1 else ''} above" if count else ""
+        return f"No problems found{warnings}." + (f" Next step: {self.next_step}" if self.next_step else "")
 
 
 def check(study: Path | str, *, workers: int | None = None) -> Checked:
@@ -66,18 +75,19 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     looked = _Look(told, None)
     reference, labels = looked.at_shared()
     looked.at_loaded(reference)
+    looked.notes[:0] = looked.grids()
     if labels is not None and told.models.results:
         looked.tried(looked.at_results, labels)
-    planned = looked.tried(plan, told)
+    planned, next_step = looked.tried(plan, told), ""
     if planned is not None and not looked.wrong:  # else only what is wrong counts
         looked.at_report_details()
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
-        looked.notes += (
-            costs(told, planned, left, *sizes_of(told), workers or usable_cores())
-            if left
-            else ["All stages are up to date; a run only rewrites the report."]
-        )
-    return Checked(tuple(looked.wrong), tuple(looked.notes))
+        if left:
+            looked.notes += costs(told, planned, left, *sizes_of(told), workers or usable_cores())
+            next_step = f"mrstrain run {study}"
+        else:
+            looked.notes.append("All stages are up to date; a run only rewrites the report.")
+    return Checked(tuple(looked.wrong), tuple(looked.notes), next_step)
 
 
 def wrong_with(study: Study, stages: Sequence[Stage]) -> tuple[str, ...]:
@@ -95,6 +105,11 @@ class _Look:
     stages: Sequence[Stage] | None
     wrong: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    on_grid: dict[str, list[str]] = field(default_factory=dict)  # names of images, by their grid in words
+
+    def grids(self) -> list[str]:
+        """A line for each grid of images."""
+        return [f"{', '.join(names)}: {grid}" for grid, names in self.on_grid.items()]
 
     def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
         """Result of a function; None if it raises an error, which is recorded once."""
@@ -124,7 +139,7 @@ class _Look:
         study, asked = self.study, self.asked
         reference = self.tried(self.image, study.images.load0) if asked("label", "register", "level") else None
         if reference is not None:
-            self.notes.append(f"Load0: {reference.grid}")
+            self.on_grid.setdefault(str(reference.grid), []).append("Load0")
         labels = self.labels(reference) if asked("label", "register", "level", "compare") else None
         every = asked("simulate", "drive", "compare")
         own = [study.directions[load] for load in study.loads if every or asked(f"register {load}")]
@@ -204,7 +219,7 @@ class _Look:
             image = self.tried(self.image, other)
             if image is None:
                 continue
-            self.notes.append(f"{name}: {image.grid}")
+            self.on_grid.setdefault(str(image.grid), []).append(name)
             same_grid = reference is not None and reference.grid.same_as(image.grid)
             if reference is not None and same_grid and np.array_equal(reference.values, image.values, equal_nan=True):
                 self.wrong.append(f"{name} is identical to the unloaded image (all voxels are equal).")
@@ -320,14 +335,17 @@ class _Look:
             )
 
     def at_report_details(self) -> None:
-        """Note which keys of [acquisition] and [credibility] are not given; none is required."""
+        """Note how many keys of [acquisition] and [credibility] are not given; none is required."""
         place = self.study.path(self.study.images.load0)
         told = read_scan_parameters(place).known() | self.study.acquisition.model_dump(exclude_none=True)
-        lacking = {
-            "acquisition": [name for name in AcquisitionOptions.model_fields if name not in told],
-            "credibility": self.study.credibility.lacking,
-        }
-        self.notes += [f"Not given in [{table}]: {', '.join(names)}" for table, names in lacking.items() if names]
+        keys = {"acquisition": AcquisitionOptions.model_fields, "credibility": CredibilityOptions.model_fields}
+        told |= self.study.credibility.model_dump(exclude_none=True)
+        lacking = {table: sum(name not in told for name in names) for table, names in keys.items()}
+        if counts := [f"{count} of {len(keys[table])} in [{table}]" for table, count in lacking.items() if count]:
+            self.notes.append(
+                f"Optional details of the report that are not given: {', '.join(counts)}. A study file written by "
+                "`mrstrain init` lists the keys."
+            )
 
     def at_results(self, labels: LabelMap) -> None:
         """Read every result of another code."""

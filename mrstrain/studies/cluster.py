@@ -159,8 +159,8 @@ class StageRunner:
                 self._submit(replace(call, lost=call.lost + 1))  # Dask blames all that wait for a worker that dies
                 return self.next()
             if call.died:
-                needs = f"; by the estimate it needs {call.gib:.1f} GiB of memory" if call.gib else ""
-                return name, f"{outcome} It was tried once more, alone{needs}.", seconds
+                needs = f"; its estimated memory need is {call.gib:.1f} GiB" if call.gib else ""
+                return name, f"{outcome} A second attempt, with no other stage running, failed too{needs}.", seconds
             self._died.append(replace(call, died=str(outcome)))
             return self.next()
         if error is None:

@@ -109,8 +109,8 @@ def _ranked(by_name: Mapping[str, StudyRun], target: Path, files: list[Path]) ->
         verdicts = by_name[name].verdicts.items()
         if doubtful := [load for load, verdict in verdicts if verdict.level == "distrust" and load != REPEAT]:
             notes.append(
-                f"{name}: the verdict on the registration of {', '.join(doubtful)} is Do not trust, but its areas are "
-                "included in the ranking. Correct the registration, or leave this subject out."
+                f"{name}: the registration of {', '.join(doubtful)} has the verdict 'Do not trust'; the areas of this "
+                "subject are nevertheless included in the ranking. Correct the registration, or leave the subject out."
             )
     try:
         ranking = rank_over_subjects(shares)
@@ -199,8 +199,8 @@ def _sections(
     order = [s.model for s in ranking] or list(shares)
     ranked = Table(
         "Models over all subjects and loads, best first",
-        ("model", "mean, %", "95 % from", "to", "smallest", "largest", "best in", "subjects", "difference to rank 1, %",
-         "95 % from", "to", "significant"),
+        ("model", "normalised area, mean, %", "95 % interval, lower", "upper", "smallest", "largest",
+         "best in (subjects)", "subjects", "difference to rank 1, %", "95 % interval, lower", "upper", "significant"),
         tuple(
             (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.best_in,
              s.subjects, 100 * s.behind, 100 * s.behind_low, 100 * s.behind_high,

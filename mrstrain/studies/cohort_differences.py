@@ -53,7 +53,7 @@ def unlike(studies: Sequence[Study]) -> list[str]:
         for key, value in _compared(study).items():
             told.setdefault(key, {})[study.study.name] = value
     return [
-        f"Subjects were measured or simulated differently; {key}: {_listed(values)}."
+        f"Setting differs between subjects: {key} {_listed(values)}. Their areas may not be comparable."
         for key, values in told.items()
         if len(set(values.values())) > 1
     ]
@@ -86,8 +86,8 @@ def _listed(values: Mapping[str, object]) -> str:
     numbers = [value for value in by_value if isinstance(value, float)]
     if len(by_value) > _NAMED and len(numbers) == len(by_value):
         return f"from {min(numbers):g} to {max(numbers):g}"
-    shown = [f"{_said(value)} in {_some(names)}" for value, names in by_value.items()]
-    return "; ".join(shown[:_NAMED]) + (f"; and {len(shown) - _NAMED} more" if len(shown) > _NAMED else "")
+    shown = [f"{_said(value)} ({_some(names)})" for value, names in by_value.items()]
+    return "= " + "; ".join(shown[:_NAMED]) + (f"; and {len(shown) - _NAMED} more" if len(shown) > _NAMED else "")
 
 
 def _said(value: object) -> str:

@@ -150,11 +150,11 @@ def costs(
     time = duration(TimeLeft(expected(left, study, voxels, cells), workers).seconds())
     gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
     needed = sum(gib[:workers])  # the largest stages may run at the same time
-    disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9
-    free = shutil.disk_usage(study.place).free / 1e9
+    disk = sum(disk_bytes(stage, study, voxels) for stage in left) / _GIB
+    free = shutil.disk_usage(study.place).free / _GIB
     lines = [
         f"To do: {len(left)} of {len(stages)} stages, about {time} on {workers} cores, "
-        f"{needed:.1f} GiB of memory, {disk:.1f} GB of disk space ({free:.0f} GB free)."
+        f"{needed:.1f} GiB of memory, {disk:.1f} GiB of disk space ({free:.0f} GiB free)."
     ]
     if further := [stage for stage in left if stage.kind == "vary" or stage.name == COARSE]:
         added = duration(sum(seconds_of(stage, study, voxels, cells) for stage in further) / workers)

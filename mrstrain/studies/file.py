@@ -69,7 +69,7 @@ class Images(SubjectFiles):
     repeat: Path | None = None
     """Second unloaded image, which measures the noise floor."""
     allow_missing: Flag = False
-    """Whether NaN and infinite voxels are left out, instead of refusing the image."""
+    """Whether NaN and infinite voxels are treated as missing, instead of rejecting the image."""
 
     @model_validator(mode="after")
     def _of_auto(self) -> Self:
@@ -120,7 +120,7 @@ class Plate(modelling.PlateOptions):
     """The plate."""
 
     plate_normal: Vector = Field(default=(0.0, 0.0, -1.0), validation_alias="normal")
-    """Outward normal of the plate, away from the body, LPS."""
+    """Direction from the body to the plate, LPS (x left, y posterior, z superior)."""
 
 
 class Registering(RegistrationOptions):
@@ -209,7 +209,7 @@ class Study(_Part):
 
     @property
     def directions(self) -> dict[str, tuple[Vector, Vector]]:
-        """Outward normal of the plate and direction of shear for each load, LPS: its own, or those of [plate]."""
+        """Direction from the body to the plate, and of shear, for each load, LPS: its own, or those of [plate]."""
         return {
             name: (load.plate_normal or self.plate.plate_normal, load.shear_direction or self.plate.shear_direction)
             for name, load in self.loads.items()

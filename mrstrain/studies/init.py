@@ -38,8 +38,8 @@ _ROLES = {
 }  # fmt: skip
 _NO_ROLE = "because its name does not indicate a role"
 _NAMES = (
-    "Names that do: Load0 or NAME_unloaded, Load1 or NAME_loaded or NAME_140N, NAME_bone, NAME_labels, Load0-again. "
-    "Rename the images, remove study.toml, and use init again."
+    "Recognised names: Load0 or NAME_unloaded, Load1 or NAME_loaded or NAME_140N, NAME_bone, NAME_labels, Load0-again. "
+    "Rename the files, delete study.toml, and run mrstrain init again."
 )
 _LOOKED_AT = 20
 PICTURE = "study.png"
@@ -98,9 +98,12 @@ class NewStudy:
         file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)
         to_fill_in = [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
         todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
-        lines += [f"Study file: {self.path}.{todo}", *to_fill_in, f"Next step: mrstrain check {self.path.parent}"]
+        lines += [f"Study file: {self.path}.{todo}", *to_fill_in]
         lines += [] if found.labels or self.makes_labels or not found.loads else self._without_labels()
-        return [*lines, f"Picture of the images found: {self.picture}"]
+        seen = (
+            "Check the picture of the images found" if isinstance(self.picture, Path) else "Picture of the images found"
+        )
+        return [*lines, f"{seen}: {self.picture}", f"Next step: mrstrain check {self.path.parent}"]
 
     def _without_labels(self) -> list[str]:
         """How to go on where the study has neither a label map nor a mask of the bone."""
@@ -110,7 +113,7 @@ class NewStudy:
         return [
             'Without a label map, paint a mask of the bone: with bone_mask and labels = "auto", the study makes the '
             "label map from the image.",
-            f"The mask is also enough to measure without labels: {measured}",
+            f"To measure strain without a label map, the mask of the bone alone is sufficient: {measured}",
         ]
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 Log = Callable[[str], None]
 _NOT_RUN = "Not run: "
+_TO_RUN = "will run"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,7 @@ class StageOutcome:
             return "not run" if self.reason.startswith(_NOT_RUN) else "FAILED"
         if self.reason:
             return "OUT OF DATE"
-        return "in part" if not self.result.complete else "up to date" if self.reused else "done"
+        return "partial" if not self.result.complete else "up to date" if self.reused else "done"
 
 
 def left_out_of(outcomes: Mapping[str, StageOutcome]) -> list[str]:
@@ -143,7 +144,7 @@ class Pipeline:
         return f"It depends on results that are out of date: {', '.join(outdated)}." if outdated else ""
 
     def forecast(self) -> dict[str, str]:
-        """What a run would do with each stage: "done already", "run", "left out", or "cannot be run" and why."""
+        """What a run would do with each stage: "up to date", "will run", "not requested", or "cannot run" and why."""
         trial = Pipeline(self.stages, self.ledger, only=self._only, force=self._force)
         to_run = set()
         while ready := trial.settle():
@@ -152,17 +153,17 @@ class Pipeline:
                 trial.outcomes[stage.name] = StageOutcome(stage.name, anew)  # different from all that others depend on
                 to_run.add(stage.name)
         return {
-            name: "run" if name in to_run
-            else "left out" if not outcome.requested
-            else f"cannot be run: {outcome.reason.removeprefix(_NOT_RUN)}" if outcome.record is None
-            else "done already"
+            name: _TO_RUN if name in to_run
+            else "not requested" if not outcome.requested
+            else f"cannot run: {outcome.reason.removeprefix(_NOT_RUN)}" if outcome.record is None
+            else "up to date"
             for name, outcome in trial.in_order().items()
         }  # fmt: skip
 
     def to_do(self) -> list[Stage]:
         """The stages that a run would execute."""
         forecast = self.forecast()
-        return [stage for stage in self.stages if forecast[stage.name] == "run"]
+        return [stage for stage in self.stages if forecast[stage.name] == _TO_RUN]
 
     def start(self, runner: "Callable[[], StageRunner]", log: Log, prefix: str = "") -> None:
         """Determine and log the outcomes that are known, and send the stages that must be run to the cluster."""

@@ -267,10 +267,14 @@ def load_steps(study: Study) -> dict[str, LoadStep]:
             lacking.append(name)
     if steps and not lacking:
         return steps
-    why = "Shear needs a normal load." if lacking else "A simulation needs at least one load with a normal load."
     places = [study.at(f"loads.{name}", "normal_n") for name in lacking or study.loads]
-    measured = "" if lacking else ", or leave out sets under [models] to measure only"
-    raise InputError("\n  ".join([f"{why} Give normal_n (N) or normal_mm in the study file{measured}:", *places]))
+    told = (
+        "Shear needs a normal force or plate displacement as well. Give normal_n (N) or normal_mm (mm) in these lines:"
+        if lacking
+        else "No load has a normal force or plate displacement, so nothing can be simulated. Give normal_n (N) or "
+        "normal_mm (mm) in at least one of these lines, or remove sets from [models] to measure only:"
+    )
+    raise InputError("\n  ".join([told, *places]))
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:

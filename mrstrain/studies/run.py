@@ -231,10 +231,14 @@ def forecast(
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
     """InputError for unknown names of stages, and for forced stages that may not be run."""
-    known = [*(stage.name for stage in stages), *KINDS]
+    names = [stage.name for stage in stages]
     for name in (*only, *force):
-        if name not in known:
-            raise InputError(f"There is no stage '{name}'. The stages are: {', '.join(known)}.")
+        if name not in (*names, *KINDS):
+            kinds = ", ".join(dict.fromkeys(stage.kind for stage in stages))
+            raise InputError(
+                f"There is no stage or kind of stage '{name}'. Kinds in this study: {kinds}. Stages: {few(names)} "
+                "(`mrstrain run --dry-run` lists all)."
+            )
     for name in force if only else ():
         forced = [stage for stage in stages if name in (stage.name, stage.kind)]
         if forced and not any({stage.name, stage.kind} & {*only} for stage in forced):

@@ -94,8 +94,8 @@ def accuracy(
     wanted = list(accuracy_cases() if cases is None else cases)
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            "An accuracy study needs at least one case, and each case only once. An engine that needs labels has no "
-            "wave motions, because they also deform bone."
+            "Give at least one case, and each only once. Wave motions also deform bone, so they cannot be used with an "
+            "engine that needs labels (gauss-newton-borders)."
         )
     for case in wanted:
         _check(case)

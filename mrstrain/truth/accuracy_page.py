@@ -32,7 +32,7 @@ _OF_ANSWER = (
 )
 _OF_ERRORS = (
     "Error: measured minus true maximum shear strain (SD: standard deviation, RMSE: root mean square, p95: 95th "
-    "percentile of its magnitude). u: displacement; its error in mm."
+    "percentile of its magnitude)."
 )
 _OF_FLOOR = (
     "MAER is the mean over voxels of the mean absolute value of the six strain components; SDER is its standard "
@@ -144,14 +144,17 @@ def motion_of(row: ErrorRow) -> str:
 
 
 def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], pictures: Sequence[Picture]) -> Section:
-    head = ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95")
+    head = (
+        "motion", "tissue", "true max. shear: median", "true max. shear: p95", "error: bias", "error: SD",
+        "error: RMSE", "error: p95", "displacement error, mm: RMSE", "displacement error, mm: p95",
+    )  # fmt: skip
     values = attrgetter(
         "tissue", "true_p50", "true_p95", "shear_bias", "shear_sd", "shear_rmse", "shear_p95", "u_rmse_mm", "u_p95_mm"
     )
     rows = tuple((motion_of(r), *map(_told, values(r))) for r in errors if r.by == "all")
     tables = [Table("Error by motion and tissue", head, rows, _OF_ERRORS)]
     if floors:
-        of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
+        of_floor = ("tissue", "MAER", "SDER", "apparent max. shear, median", "apparent max. shear, p95")
         floor = attrgetter("tissue", "maer", "sder", "shear_p50", "shear_p95")
         noise = tuple(tuple(map(_told, floor(f))) for f in floors)
         tables.append(Table("Noise floor: apparent strain between two unloaded images", of_floor, noise, _OF_FLOOR))
@@ -191,9 +194,10 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
         return (*r.condition, r.motion, r.tissue, r.left_over, *(100 * share for share in within))
 
     note = (
-        "Each motion is compared with a model fitted to the other motions. Voxels: true max. shear within 1.96 SD; if "
-        "the model is correct, 95 %. Normal strain, shear strain, displacement: the same for components. Statistics: "
-        "percentiles and volumes of the tissue within the intervals that `register` would give."
+        "Leave-one-motion-out validation: the error model is fitted to the other motions and tested on this one. "
+        "Columns give the percentage of voxels (max. shear within 1.96 SD), of components of strain and displacement, "
+        "or of the tissue's percentiles and volumes (within the intervals that `register` would give) whose true value "
+        "lies within its 95 % interval; 95 % is expected."
     )
     table = Table("Coverage of the error model", columns, tuple(cells(row) for row in rows), note)
     return Section("Validation of the error model", tables=(table,))
@@ -205,7 +209,7 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
         noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == POOLED), (None, None, None))
         wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
         table_rows.append((*of_condition[0].condition, *wavelengths, *noise))
-    columns = (*_CONDITION, "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
+    columns = (*_CONDITION, "90 % at, mm", "50 % at, mm", "apparent max. shear, median", "MAER", "SDER")
     drawings = {"resolution": Drawing.of("Spatial resolution", figures.resolution, rows)}
     if known := figures.noise_and_resolution(floors, rows, POOLED):
         names = ("condition", "wavelength_recovered_to_90_percent_mm", "max_shear_without_load")

@@ -68,7 +68,7 @@ class AccuracyStudy:
         with whole_folder(out / FIGURES) as folder:
             sections = sections_of(errors, floors, resolution, coverage, failures, folder)
         notes = [f"Incomplete: {len(failures)} of {len(runs) + len(failures)} cases failed."] if failures else []
-        title, lines = "Accuracy of registration presets", record_lines(record)
+        title, lines = "Accuracy of registration engines", record_lines(record)
         write_report(out / REPORT, title, None, sections, [HOW_TO_READ], lines, notes=notes)
         return study
 

@@ -8,7 +8,7 @@ from dvc.atomic_files import write_json
 from dvc.io.result_folder import PROVENANCE
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
-from mrstrain.options.measurement import Frame, SubjectFiles
+from mrstrain.options.measurement import ExistingFiles, Frame
 from mrstrain.records.inputs import alone, output_folder, read_subject, refuse_touching_inputs
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.provenance import provenance
@@ -20,7 +20,7 @@ _IMAGE = "twin.nii.gz"
 
 @door
 def twin(
-    load0: Path | str, deformation: Path | str, *, out: Path | str, subject_files: SubjectFiles,
+    load0: Path | str, deformation: Path | str, *, out: Path | str, subject_files: ExistingFiles,
     frame: Frame | None = None, seed: int = 1,
 ) -> Outcome:  # fmt: skip
     """Warp an unloaded image by a deformation, as if it had been scanned under load, and write the truth.

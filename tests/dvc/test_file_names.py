@@ -26,7 +26,7 @@ ODD = ("", " x", "x ", "x.", ".x", "CON", "nul.txt", "Com1", "lpt³", "a" * 201,
 
 @pytest.mark.parametrize("name", [*OUTSIDE, *ODD])
 def test_it_is_refused_wherever_it_is_given(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ValueError, match=r"becomes the name of a folder|device on Windows"):
+    with pytest.raises(ValueError, match=r"used as a folder name|too long for a folder name|reserved on Windows"):
         as_file_name(name)
     with pytest.raises(InputError, match="The name of the load"):
         fe.LoadStep(name, normal_n=1.0)
@@ -52,7 +52,7 @@ def test_an_image_whose_name_is_none_is_named(file: str, what: str) -> None:
 def test_a_load_of_a_study_file_is_named_with_its_line(tmp_path: Path, name: str) -> None:
     text = f'[study]\nname = "a"\n[images]\nload0 = "a.nii"\nlabels = "b.nii"\n[loads."{name}"]\nimage = "c.nii"\n'
     (tmp_path / "study.toml").write_text(text)
-    with pytest.raises(InputError, match=r"becomes the name of a folder|device on Windows"):
+    with pytest.raises(InputError, match=r"used as a folder name|too long for a folder name|reserved on Windows"):
         read_study(tmp_path)
 
 

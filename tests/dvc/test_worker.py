@@ -204,7 +204,7 @@ def test_a_task_whose_answer_no_thread_takes_is_ended(monkeypatch):
     with Worker(threads=1) as worker:
         with monkeypatch.context() as without:
             without.setattr(process_executor._ExecutorManagerThread, "run", lambda _: None)
-            with pytest.raises(WorkerError, match="memory ran out while meshing, beside its process"):
+            with pytest.raises(WorkerError, match="memory ran out while meshing, in the process that waits for it"):
                 worker.run("meshing", sum, [1, 2])
         assert worker.run("adding", sum, [1, 2]) == 3
 

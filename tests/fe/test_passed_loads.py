@@ -45,8 +45,12 @@ def test_a_load_passes_only_loads_of_an_equal_plate() -> None:
 @pytest.mark.parametrize(
     ("those", "plate", "why"),
     [
-        ([SHEARED], PLATE, "cannot pass sheared, which has shear"),
-        ([LoadStep("in", normal_mm=0.5)], PLATE, "cannot pass in, which has shear, or prescribes force"),
+        ([SHEARED], PLATE, "cannot include sheared as an intermediate state: sheared has shear"),
+        (
+            [LoadStep("in", normal_mm=0.5)],
+            PLATE,
+            "cannot include in as an intermediate state: in has shear, or one",
+        ),
         ([LoadStep("equal", 2.5)], PLATE, "equal is not smaller than large"),
         ([LoadStep("large", 1.0)], PLATE, "Two loads are named 'large'"),
         ([LoadStep("middle", 2.0), SMALL], PLATE, "middle is not smaller than small"),
@@ -154,7 +158,11 @@ def test_the_command_solves_them_once_on_one_core(tmp_path: Path) -> None:
         shear_direction=ALONG, out=tmp_path / "out", workers=1, threads=1,
     )  # fmt: skip
     assert [state.load.name for state in made.sets[0].states] == ["large", "small", "sheared"]
-    assert (tmp_path / "out" / "trebbi" / "log-large.txt").read_text().startswith("small: resumed at 100%")
+    assert (
+        (tmp_path / "out" / "trebbi" / "log-large.txt")
+        .read_text()
+        .startswith("small: resumed from the checkpoint at 100 %")
+    )
 
 
 def test_nodes_touch_in_the_order_of_small_steps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -205,7 +205,7 @@ def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
     again = CliRunner().invoke(app, [*command, "--out", str(out.parent)])
     assert again.exit_code == 0, again.output
     log = (out / "log-a.txt").read_text().splitlines()
-    assert log[0] == "a: resumed at 100%, as solved before"
+    assert log[0] == "a: resumed from the checkpoint at 100 % of the load"
     assert not any(line.startswith("moved") for line in log)
     for load in ("a", "b", "c"):
         one, other = (meshio.read(folder / "luboz" / f"{load}.vtu") for folder in (tmp_path / "uncut", out.parent))

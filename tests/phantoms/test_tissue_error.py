@@ -51,7 +51,7 @@ def test_only_the_voxels_asked_for_are_scored() -> None:
     where[:2] = True
     rows = errors_by_tissue(labels(), rest, rest, where)
     assert [(row.tissue, row.voxels) for row in rows] == [("fat", 50)]
-    with pytest.raises(GeometryError, match="grid of the labels"):
+    with pytest.raises(GeometryError, match=r"but the labels have shape"):
         errors_by_tissue(labels(), rest, rest, where[:-1])
 
 

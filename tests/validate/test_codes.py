@@ -276,13 +276,13 @@ def test_an_element_that_is_lost_from_a_calculix_result_is_missed(folder: Path, 
 def test_a_time_that_is_no_number_is_refused(folder: Path, tmp_path: Path) -> None:
     text = (folder / "calculix/c3d4.frd").read_text()
     (tmp_path / "Load1.frd").write_text(text.replace("105 1.000000000", "105         inf"))
-    with pytest.raises(ImageFileError, match=r"Load1\.frd: a head of results cannot be read \(inf is no number"):
+    with pytest.raises(ImageFileError, match=r"Load1\.frd: a head of results cannot be read \(inf is not a valid"):
         early_end(tmp_path / "Load1.frd")
     time = struct.pack("<IIf", 0x02010002, 4, 1.0)
     data = (folder / "febio/tet4.xplt").read_bytes()
     assert data.count(time) == 1
     (tmp_path / "Load1.xplt").write_bytes(data.replace(time, struct.pack("<IIf", 0x02010002, 4, np.nan)))
-    with pytest.raises(ImageFileError, match=r"Load1\.xplt: .*nan is no number"):
+    with pytest.raises(ImageFileError, match=r"Load1\.xplt: .*nan is not a valid result value"):
         early_end(tmp_path / "Load1.xplt")
 
 
@@ -298,13 +298,13 @@ def test_without_log_and_deck_a_time_that_is_not_whole_or_a_file_without_its_end
     text = (folder / "calculix/c3d4.frd").read_text()
     (tmp_path / "Load1.frd").write_text(text.removesuffix(" 9999\n"))
     end = early_end(tmp_path / "Load1.frd")
-    assert end == ("has no end in its result (the line 9999) and stopped at time 1", True)
+    assert end == ("did not finish: its result has no last line (9999), and it stopped at time 1", True)
     cut = tmp_path / "tet4.xplt"
     cut.with_suffix(".log").write_text("F O R   B I O M E C H A N I C S\n===== beginning time step 5 : 1 =====\n")
     end = early_end(cut)
     assert end is not None
     assert end.certain
-    assert "no end in its log" in end.reason
+    assert "no termination message" in end.reason
     with cut.with_suffix(".log").open("a") as log:  # the end of a long log counts, and is all that is read
         log.write("a line of an iteration\n" * 20_000 + " N O R M A L   T E R M I N A T I O N\n")
     assert early_end(cut) is None
@@ -330,4 +330,4 @@ def test_nodes_that_are_left_out_are_told(
     folder: Path, caplog: pytest.LogCaptureFixture, name: str, told: bool
 ) -> None:
     read_mesh(folder / f"febio/{name}.xplt")
-    assert ("of each element of 15 nodes, the first 10 are taken, as of tetra10" in caplog.text) == told
+    assert ("elements with 15 nodes are read as tetra10, by their first 10 nodes" in caplog.text) == told

@@ -167,7 +167,7 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
     ended = lambda studies, **_: [StudyRun(study, {"compare": StageOutcome("compare", record)}) for study in studies]  # noqa: E731
     monkeypatch.setattr("mrstrain.studies.cohort.run_studies", ended)
     alike = cohort(places, out=tmp_path / "alike")
-    assert not any("measured or simulated differently" in note for note in alike.notes)
+    assert not any("differs between subjects" in note for note in alike.notes)
     assert "Mueller_Hans" not in "".join(file.read_text(errors="ignore") for file in (tmp_path / "alike").iterdir())
 
     other = places[1] / "study.toml"
@@ -177,9 +177,9 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
         + '[registration]\nengine = "elastix"\n'
     )
     notes = cohort(places, out=tmp_path / "unlike").notes
-    begin = "Subjects were measured or simulated differently; "
-    assert f"{begin}[loads.Load1] normal_n: none in Ada, Cy; 15 in Ben." in notes
-    assert f"{begin}[registration] engine: gauss-newton-borders in Ada, Cy; heel-mr in Ben." in notes
+    begin, end = "Setting differs between subjects: ", " Their areas may not be comparable."
+    assert f"{begin}[loads.Load1] normal_n = none (Ada, Cy); 15 (Ben).{end}" in notes
+    assert f"{begin}[registration] engine = gauss-newton-borders (Ada, Cy); heel-mr (Ben).{end}" in notes
     assert len([note for note in notes if note.startswith(begin)]) == 2  # a shear of nothing is none
 
     for place, mu in zip(places, (10, 10, 999), strict=True):
@@ -195,8 +195,8 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
         (places[1] / "study.toml").read_text() + 'limit_minutes = 5\n[loads.Load2]\nimage = "Load2.nii.gz"\n'
     )
     notes = cohort(places[:2], out=tmp_path / "more").notes
-    assert f"{begin}[loads]: Load1 in Ada; Load1, Load2 in Ben." in notes
-    assert f"{begin}[models] limit_minutes: none in Ada; 5 in Ben." in notes
+    assert f"{begin}[loads] = Load1 (Ada); Load1, Load2 (Ben).{end}" in notes
+    assert f"{begin}[models] limit_minutes = none (Ada); 5 (Ben).{end}" in notes
 
 
 def test_files_that_are_lacking_are_told_of_all_subjects_at_once(tmp_path):

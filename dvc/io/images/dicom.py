@@ -218,15 +218,14 @@ def _pick_stack(place: Path, stacks: dict[str, _Stack], series: str | None) -> _
     lines = [f"  {name}: {stack.describe()}" for name, stack in stacks.items()]
     if len(lines) > _LISTED:
         lines[_LISTED:] = [f"  and {len(lines) - _LISTED} more, named in the same way"]
-    what, move = "file", "Write one image"
+    what, move = "file", "Convert it"
     if place.is_dir():
-        what, move = "folder", "Move one image to its own folder, or write it"
+        what, move = "folder", "Move one image to its own folder, or convert all"
     problem = f"series='{series}' matches {len(matching)} of the DICOM series in this {what}"
     if series is None:
         several = len({stack.series for stack in stacks.values()})
-        problem = f"the {what} has {f'{several} DICOM series' if several > 1 else _SEVERAL}, but one image is needed"
+        problem = f"this {what} contains {f'{several} DICOM series' if several > 1 else _SEVERAL}; one image is needed"
     raise InputError(
-        f"{place}: {problem}. {move} to a file in Python: "
-        f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)), with a NAME of these:\n'
-        + "\n".join(lines)
+        f"{place}: {problem}. {move} (dcm2niix) and pass one .nii.gz file. In Python: "
+        f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)), with NAME one of:\n' + "\n".join(lines)
     )

@@ -130,7 +130,7 @@ def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
         enhanced = "PerFrameFunctionalGroupsSequence" in header or "Enhanced" in stored.name
         kinds = [str(k) for k in _several(header.get("ImageType"))]
         if not enhanced and ("MOSAIC" in kinds or int(header.get("NumberOfFrames") or 1) > 1):
-            problem = "mosaics, and multi-frame DICOM files without the positions of their frames, are not supported"
+            problem = "this is a mosaic or a multi-frame DICOM file without frame positions, which is not supported"
             raise ImageFileError(f"{path}: {problem}. {CONVERT}")
         needed = _NEEDED if enhanced else (*_NEEDED, *_PLACE)
         _refuse_missing(path, [name for name in needed if header.get(name) is None])

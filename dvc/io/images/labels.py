@@ -181,8 +181,8 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     mirrored = _mirrored_axes(own, grid)
     if mirrored:
         raise GeometryError(
-            f"{what}: its grid is that of the image with the signs of {mirrored} reversed, so RAS and LPS were "
-            f"confused. {boxes} Export it again from its image."
+            f"{what}: its grid equals that of the image with {mirrored} negated: RAS and LPS coordinates were mixed "
+            f"up. {boxes} Export it again with the image loaded."
         )
     fitted: Any = _nearest(own, values, grid)
     left = np.count_nonzero(fitted) * grid.voxel_volume_mm3

@@ -72,7 +72,8 @@ def read_image(
         problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
         if not allow_missing:
             raise InputError(
-                f"{path}: {problem}. Repair the image, or leave these voxels out (allow_missing), as those of a map."
+                f"{path}: {problem}. Repair the image, or treat these voxels as missing: `allow_missing` "
+                "(--allow-missing on the command line)."
             )
         _log.warning("%s: %s; treated as missing", path, problem)
         values = np.where(finite, values, np.float32(np.nan))
@@ -120,8 +121,8 @@ def _refuse_size_of_no_body(place: Path, grid: Grid, unit: str) -> None:
         size = f"{longest / 1000.0:.3g} m" if longest > _LARGEST_MM else f"{longest:.2g} mm"
         likely = "mm" if unit != "mm" else "micrometres" if longest > _LARGEST_MM else "metres"
         raise ImageFileError(
-            f"{place}: by its header, in {unit}, the image is {size} across, which no body part is. Its voxel sizes "
-            f"are probably in {likely}. Correct the header."
+            f"{place}: according to its header (unit {unit}), the image is {size} across, which is impossible for a "
+            f"body part. Its voxel sizes are probably in {likely}. Correct the header."
         )
 
 

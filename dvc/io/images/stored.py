@@ -125,7 +125,7 @@ def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
                 continue
             pending = decoder.unconsumed_tail or file.read(_BLOCK)
             if not pending and not block:
-                problem = "the file is incomplete: its compressed voxels have no end"
+                problem = "the file is incomplete: its compressed data end too early"
                 raise ImageFileError(f"{path}: {problem}. Copy or export it again.")
 
 
@@ -167,7 +167,7 @@ def pick_volume(path: Path, count: int, volume: int | None) -> int:
         if count == 1:
             return 0
         raise ImageFileError(
-            f"{path}: the file has {count} volumes, but one is needed. Write it to a file of its own in Python: "
+            f"{path}: the file contains {count} volumes; one is needed. Write it to a file of its own, in Python: "
             f'dvc.write_image("one.nii.gz", dvc.read_image("{path}", volume=N)), with N from 0 to {count - 1}.'
         )
     if not 0 <= volume < count:

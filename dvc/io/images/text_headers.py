@@ -51,7 +51,7 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
         raise ImageFileError(f"{path}: not an NRRD file (it does not start with NRRD). Export it again.")
     end = re.search(rb"\r?\n\r?\n", start)
     if end is None and path.stat().st_size >= _HEADER_LIMIT:
-        raise ImageFileError(f"{path}: the NRRD header has no end; the file is damaged. Export it again.")
+        raise ImageFileError(f"{path}: no empty line ends the NRRD header; the file is damaged. Export it again.")
     text = start[: end.start() if end else len(start)].decode("utf-8", errors="replace")
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}

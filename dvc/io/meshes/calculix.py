@@ -125,8 +125,8 @@ def _add_elements(
         _log.info("%s: %d shells, membranes or beams, expanded to solids, are left out.", mesh.path, left_out)
     if alike:
         _log.warning(
-            "%s: %d elements may be shells that CalculiX expanded to solids, and count as tissue. Put the deck (%s), "
-            "with these elements in it, beside the result, or write it with OUTPUT=2D.",
+            "%s: %d elements may be shells that CalculiX expanded to solids, and count as tissue. To have them "
+            "recognised, put the input deck with them (%s) next to the result, or write the result with OUTPUT=2D.",
             mesh.path, alike, mesh.path.with_suffix(".inp").name,
         )  # fmt: skip
 

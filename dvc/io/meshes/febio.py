@@ -139,8 +139,8 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
         width, kind, taken = _KINDS[number]
         if taken < width:
             _log.warning(
-                "%s: of each element of %d nodes, the first %d are taken, as of %s. Between them, displacements may "
-                "differ from FEBio's.", path, width, taken, kind,
+                "%s: elements with %d nodes are read as %s, by their first %d nodes; between these, displacements may "
+                "differ from FEBio's.", path, width, kind, taken,
             )  # fmt: skip
         rows = np.frombuffer(_at(domain, _ELEMENTS), "<u4").reshape(-1, width + 3)
         if not ((rows[:, 0] == _ELEMENT).all() and (rows[:, 1] == 4 * (width + 1)).all()):

@@ -138,7 +138,7 @@ def read_text(path: Path) -> str:
 def finite(number: float) -> float:
     """The number unchanged; ValueError if it is NaN or infinite."""
     if not math.isfinite(number):
-        raise ValueError(f"{number} is no number that a result can have")
+        raise ValueError(f"{number} is not a valid result value")
     return number
 
 

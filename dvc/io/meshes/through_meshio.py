@@ -92,7 +92,7 @@ class _BoundedFile(io.BufferedReader):
         """The next line; ValueError for a count of more than the file holds, and the second time at its end."""
         line = super().readline(size)
         if line.strip().isdigit() and int(line) > self._most:
-            raise ValueError(f"the file cannot hold {int(line)} of anything")
+            raise ValueError(f"the file states {int(line)} items, more than its size allows")
         if self._ended and not line:
             raise ValueError("the file ends within a section")
         self._ended = not line
@@ -143,7 +143,7 @@ def _tags_of_41(path: Path, data: bytes, is_text: bool, size: int) -> IntArray:
 
         def read(kind: npt.DTypeLike, count: int) -> npt.NDArray[Any]:
             if count > len(data):
-                raise ValueError(f"the file cannot hold {count} of anything")
+                raise ValueError(f"the file states {count} items, more than its size allows")
             values = np.fromfile(file, kind, count, " " if is_text else "")
             if len(values) < count:
                 raise ValueError(f"the file ends before {count} numbers")

@@ -156,7 +156,7 @@ def _read_in_a_worker(path: Path) -> Deformation:
 
     def watch() -> None:
         if time.monotonic() > over:
-            raise InputError("reading it does not end. The file is damaged; copy or export it again.")
+            raise InputError("reading it timed out; the file is probably damaged. Copy or export it again.")
 
     with Worker(threads=1) as worker:
         try:

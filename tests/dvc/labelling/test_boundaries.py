@@ -85,7 +85,9 @@ def test_labels_that_end_in_tissue_keep_their_boundaries_there(heel: tuple[Image
     for slices in (slice(low, low + 2), slice(high - 2, high)):
         assert np.mean((made.labels.labels != labels)[:, :, slices][labels[:, :, slices] > 0]) < 0.01
     assert np.mean((made.labels.labels != labels)[labels > 0]) < 0.03
-    assert made.notes == ("Boundaries are unchanged where the labels end inside tissue.",)
+    assert made.notes == (
+        "Where the label map ends inside tissue (truncation surface), boundaries were not corrected.",
+    )
 
 
 def test_skin_that_the_image_does_not_show_stays_and_is_told(heel: tuple[Image, LabelMap]) -> None:

@@ -98,7 +98,7 @@ def test_a_bone_as_dark_as_muscle_tells_of_suppressed_fat() -> None:
 
 
 def test_a_bone_outside_the_body_is_refused() -> None:
-    with pytest.raises(InputError, match="Only 0% of the bone is in the body"):
+    with pytest.raises(InputError, match="Only 0 % of the mask of the bone is inside the body"):
         label_tissues(body(), Mask(GRID, ball((-20.0, -20.0, -20.0), 4.0)))
 
 

@@ -49,9 +49,9 @@ def test_a_mark_of_a_bone_outside_of_one_is_refused() -> None:
     in_fat = LabelMap(grid, (strokes(truth, {2: 1}).labels > 0).astype(int), {1: "talus"})
     with pytest.raises(InputError, match="The mark of talus is not in marrow"):
         label_tissues(image, marks=in_fat)
-    with pytest.raises(InputError, match="need a bone"):
+    with pytest.raises(InputError, match="A bone is needed"):
         label_tissues(image, marks=LabelMap(grid, in_fat.labels, {1: "fat"}))
-    with pytest.raises(InputError, match="need a bone"):
+    with pytest.raises(InputError, match="A bone is needed"):
         label_tissues(image)
 
 

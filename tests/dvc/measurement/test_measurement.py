@@ -70,7 +70,9 @@ def test_labels_made_from_the_image_are_told_and_count_in_the_verdict(measured) 
     unsure = again(LabelsFromImage(0.21, (note,)))
     assert unsure.verdict.level == "caution"
     assert unsure.verdict.reasons[-2] == f"The label map was made from the image. {note}"
-    assert "21 % of its voxels have an uncertain label (use with care above 20 %)" in unsure.verdict.reasons[-1]
+    assert (
+        "21 % of its voxels have an uncertain label (limit: 'Use with care' above 20 %)" in unsure.verdict.reasons[-1]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -332,7 +334,7 @@ def test_a_measurement_read_again_shows_the_same_slices(stretched, tmp_path):
 def test_an_argument_is_called_as_it_was_given(stretched):
     with pytest.raises(InputError, match=r"plate_normal \(--plate-normal on the command line\) must be three"):
         dvc.measure(stretched.image, stretched.image, plate_normal=(0.0, 0.0, 0.0))
-    with pytest.raises(InputError, match=r"tissue \(--tissue on the command line\)"):
+    with pytest.raises(InputError, match=r"`tissue` \(--tissue on the command line\)"):
         dvc.tissue_mask(dvc.Image(GRID, np.ones(GRID.shape)))
 
 

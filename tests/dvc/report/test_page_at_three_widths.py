@@ -39,7 +39,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tuple((model, "0 to 3 mm", *6 * ("0.72 (0.00 to 1.33)",)) for model in ("trebbi", "no deformation")),
     )  # fmt: skip
     picture = Picture("Strain", "How to read it.", png(), (("unloaded", png()), ("Load1, registered", png())))
-    doubtful = Verdict("caution", ("Bone moves by 0.4 mm (use with care above 0.3 mm).",))
+    doubtful = Verdict("caution", ("Bone moves by 0.4 mm (limit: 'Use with care' above 0.3 mm).",))
     sections = [
         Section("Load1", Verdict("trust"), (table,), (picture,), ("What was found.",), summary=table),
         Section("Load2", doubtful, (areas,), folded=True),

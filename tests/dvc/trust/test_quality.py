@@ -229,7 +229,7 @@ def test_a_registration_is_undefined_away_from_its_tissue():
 @pytest.mark.parametrize(
     ("p95", "says"),
     [
-        (0.06004, "0.06004 (95th percentile; use with care above 0.06, do not trust above 0.15)"),
+        (0.06004, "0.06004 (95th percentile; limits: 'Use with care' above 0.06, 'Do not trust' above 0.15)"),
         (0.15002, "0.15002 (95th percentile;"),
         (0.0712, "0.071 (95th percentile;"),
     ],
@@ -243,6 +243,18 @@ def test_a_figure_beyond_its_limit_does_not_read_as_if_it_were_the_limit(p95: fl
 def test_a_figure_that_is_not_finite_is_not_known() -> None:
     maps, endless = strain_maps(STRETCH, WHOLE), replace(ALIKE, offset=(np.inf, np.inf))
     assert assess(maps, WHOLE, None, similarity=endless).verdict.level == "trust"
+
+
+def test_tissue_compressed_too_far_is_told_with_its_place_and_where_it_is_seldom_real() -> None:
+    maps = strain_maps(STRETCH, WHOLE)
+    jacobian = maps.jacobian.copy()
+    jacobian[2, 2, 2] = 0.21
+    quality = assess(replace(maps, jacobian=jacobian), WHOLE, None, similarity=ALIKE)
+    (told,) = quality.verdict.reasons
+    place = ", ".join(f"{c:.1f}" for c in quality.lowest_jacobian_at_mm)
+    assert "ratio is 0.21" in told
+    assert "(limits: 'Use with care' below 0.3, 'Do not trust' below 0)" in told
+    assert told.endswith(f"Look there, at LPS ({place}) mm; at the edge of the body it is seldom real.")
 
 
 def test_a_fold_of_nearly_zero_is_not_called_minus_zero() -> None:

@@ -9,8 +9,12 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from dvc import preset_names
 from mrstrain.cli.app import app
 from mrstrain.cli.options import EXAMPLES
+from mrstrain.models.simulate import LOADS
+from mrstrain.options.modelling import ComparisonOptions, Directions
+from validate import read_thresholds
 
 COMMANDS = typer.main.get_command(app).commands
 HELP = {name: CliRunner().invoke(app, [name, "--help"], terminal_width=100).output for name in COMMANDS}
@@ -77,6 +81,30 @@ def test_the_page_on_register_lists_every_option_and_no_other() -> None:
     offered = [name for one in COMMANDS["register"].params for name in (*one.opts, *one.secondary_opts)]
     names = [name.strip("`").split(" ")[0] for name in listed]
     assert sorted(names) == sorted(name for name in offered if name.startswith("--"))
+
+
+def test_defaults_in_the_words_of_a_help_are_those_that_are_used() -> None:
+    told = {name: " ".join(text.split()) for name, text in HELP.items()}
+    loads = [f"{load.name}={load.normal_n:g}" + (f",{load.shear_n:g}" if load.shear_n else "") for load in LOADS]
+    assert f"Default: the published loads {', '.join(loads[:-1])} and {loads[-1]}." in told["simulate"]
+    levels = [f"{one.max_shear:g}" for one in read_thresholds()]
+    assert f"Default: {', '.join(levels[:-1])} and {levels[-1]}." in told["compare"]
+    assert "Default: {:g} {:g}.".format(*ComparisonOptions().strains) in told["compare"]
+    for vector in (Directions().plate_normal, Directions().shear_direction):
+        assert "Default: {:g} {:g} {:g} (".format(*vector) in told["simulate"]
+    assert f"Built-in elastix parameters: {', '.join(preset_names())}." in told["register"]
+
+
+def test_only_register_offers_to_make_the_label_map() -> None:
+    assert [name for name, text in HELP.items() if "or auto to make it" in " ".join(text.split())] == ["register"]
+    assert "--labels <path> Label map of the tissues on the unloaded image. --names" in " ".join(HELP["strain"].split())
+
+
+@pytest.mark.parametrize("name", [name for name, text in HELP.items() if "--plate-normal" in text])
+def test_directions_are_explained_where_they_are_asked_for(name: str) -> None:
+    told = " ".join(HELP[name].split())
+    assert "Direction from the body to the plate, in LPS (x left, y posterior, z superior)." in told
+    assert told.count("x left") == 1
 
 
 def test_a_simulation_says_nothing_of_elastix() -> None:

@@ -101,7 +101,7 @@ def test_marks_without_names_have_the_usual_ones(folder: Path, tmp_path: Path) -
 
 def test_what_cannot_be_labelled_is_refused_before_anything_is_written(folder: Path, tmp_path: Path) -> None:
     load0, bone = folder / "Load0.nii.gz", folder / "bone.nii.gz"
-    with pytest.raises(InputError, match="need a bone"):
+    with pytest.raises(InputError, match="A bone is needed"):
         mrstrain.label(load0, out=tmp_path / "a" / "t.nii.gz")
     with pytest.raises(InputError, match=r"must end in \.nii\.gz"):
         mrstrain.label(load0, bone=bone, out=tmp_path / "a" / "t.png")
@@ -120,7 +120,7 @@ def test_an_image_without_a_dark_surface_says_so(folder: Path, tmp_path: Path) -
     write_mask(tmp_path / "bone.nii.gz", bone)
     told = mrstrain.label(tmp_path / "even.nii.gz", bone=tmp_path / "bone.nii.gz", out=tmp_path / "t.nii.gz").summary()
     assert any("No skin was found" in line for line in told)
-    assert any("One tissue was found" in line for line in told)
+    assert any("only one tissue was found" in line for line in told)
     assert set(read_labels(tmp_path / "t.nii.gz", tmp_path / "t.csv").names.values()) == {"bone", "fat"}
 
 
@@ -146,7 +146,7 @@ def test_what_is_corrected_needs_no_mask_and_names_need_labels(folder: Path, tmp
     load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "t.nii.gz"
     with pytest.raises(InputError, match="give it without masks or marks"):
         mrstrain.label(load0, labels=bone, bone=bone, out=out)
-    with pytest.raises(InputError, match="names are those of a label map"):
+    with pytest.raises(InputError, match="`names` is for the label map `labels`, which is not given"):
         mrstrain.label(load0, bone=bone, names=tmp_path / "names.csv", out=out)
     assert not list(tmp_path.iterdir())
 
@@ -177,7 +177,7 @@ def test_another_subjects_labels_are_carried_over_and_counted_as_made(folder: Pa
 
 def test_what_cannot_be_carried_over_is_refused(folder: Path, tmp_path: Path) -> None:
     load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "t.nii.gz"
-    with pytest.raises(InputError, match="from_image needs its label map"):
+    with pytest.raises(InputError, match="`from_image` needs the label map of that image, `labels`"):
         mrstrain.label(load0, from_image=load0, out=out)
     with pytest.raises(InputError, match="not both"):
         mrstrain.label(load0, from_image=load0, labels=bone, marks=bone, out=out)

@@ -102,7 +102,8 @@ def test_every_promised_file_is_there(results, study, name):
 
 def test_the_report_says_which_images_it_is_about(results, study, tiny_pair):
     page = (study / "out" / "report.html").read_text()
-    voxels = str(tiny_pair.reference.grid).partition(", box")[0]
+    voxels = str(tiny_pair.reference.grid).partition("; ")[0]
+    assert re.fullmatch(r"[\d x]+ voxels of [\d. x]+ mm", voxels)
     assert re.search(rf"<p>Images: [^<]*Load0[^<]*, [^<]*Load1[^<]*\. Maps of {voxels}\.</p>", page)
 
 

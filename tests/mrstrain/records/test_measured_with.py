@@ -55,7 +55,7 @@ def test_results_that_were_moved_alone_find_their_files_from_where_one_works(
 ) -> None:
     far = tmp_path / "a" / "b" / "c" / "d"
     shutil.move(project / "results", far / "results")
-    with pytest.raises(InputError, match=r"bone mask bone.nii.gz .* neither near the results nor in the working"):
+    with pytest.raises(InputError, match=r"bone mask bone.nii.gz .* neither in the folders around the results nor"):
         recorded(far).file("bone")
     monkeypatch.chdir(project)
     assert recorded(far).file("bone") == Path("bone.nii.gz")

@@ -114,7 +114,8 @@ REFUSED: dict[str, tuple[str, Give]] = {
         "has only 1 of the image's voxels",
         lambda out, files: mrstrain.label(LOAD0, out=out / "t.nii.gz", bone=bone(files, voxels=1))),
     "label, bone in the air": (
-        "of the bone is in the body", lambda out, files: mrstrain.label(LOAD0, out=out / "t.nii.gz", bone=bone(files))),
+        "of the mask of the bone is inside the body",
+        lambda out, files: mrstrain.label(LOAD0, out=out / "t.nii.gz", bone=bone(files))),
     "mesh, no bone": (
         "no region 'bone'", lambda out, files: mrstrain.mesh(**without_bone(files), out=out / "m.vtu", edge_mm=4.0)),
     "mesh, no such bone": (

@@ -67,11 +67,11 @@ def test_a_study_without_models_begins_with_the_strain_in_a_picture(study):
 
 
 def test_only_what_another_mask_changes_is_done_anew(study, tiny_pair):
-    assert set(forecast(study).values()) == {"done already"}
+    assert set(forecast(study).values()) == {"up to date"}
     smaller = Mask(tiny_pair.bone.grid, binary_erosion(tiny_pair.bone.inside))
     write_mask(study / "calcaneus.nii.gz", smaller)
     try:
-        assert forecast(study) == {"label": "run", "register Load1": "run"}
+        assert forecast(study) == {"label": "will run", "register Load1": "will run"}
     finally:
         write_mask(study / "calcaneus.nii.gz", tiny_pair.bone)
 
@@ -91,9 +91,9 @@ def test_a_series_makes_its_label_map_as_a_study_does(study, tmp_path, in_this_p
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({}, "give the mask of the bone"),
-        ({"bone": "calcaneus.nii.gz", "names": "names.csv"}, "names and bone_label are for a label map of your own"),
-        ({"bone": "calcaneus.nii.gz", "allow_missing": True}, "not together with allow_missing"),
+        ({}, "labels auto also needs the mask of the bone"),
+        ({"bone": "calcaneus.nii.gz", "names": "names.csv"}, "`names` and `bone_label` need a label map of your own"),
+        ({"bone": "calcaneus.nii.gz", "allow_missing": True}, "cannot be combined with `allow_missing`"),
         ({"bone": "calcaneus.nii.gz", "loads": ["labels.nii.gz"]}, "A loaded image is named 'labels'"),
     ],
 )

@@ -16,6 +16,7 @@ from dvc.io.images.write import write_image, write_labels
 from dvc.mesh import TetMesh
 from fe import write_tet_mesh
 from mrstrain.cli.app import app
+from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.studies import stages
 from mrstrain.studies.check import check, wrong_with
 from mrstrain.studies.file import read_study
@@ -90,30 +91,50 @@ def test_the_command_ends_with_status_2_where_something_is_wrong_and_0_where_not
     assert "ERROR" in ill.output
 
 
-def test_what_is_not_given_of_acquisition_and_credibility_is_a_note_in_one_line_each(study):
-    def told() -> dict[str, str]:
+def test_details_that_nobody_must_give_are_one_note_and_no_problem(study):
+    def told(more: str) -> list[str]:
+        (study / "study.toml").write_text(STUDY.replace('"mine.toml", ', "") + more)
         done = check(study)
         assert not done.wrong
-        notes = [note.partition(": ") for note in done.notes if note.startswith("Not given in ")]
-        return {table.removeprefix("Not given in "): names for table, _, names in notes}
+        assert done.summary()[-1] == f"No problems found. Next step: mrstrain run {study}"
+        return [note for note in done.notes if "[acquisition]" in note or "[credibility]" in note]
 
-    (study / "study.toml").write_text(STUDY.replace('"mine.toml", ', ""))
-    before = told()
-    assert list(before) == ["[acquisition]", "[credibility]"]
-    assert before["[credibility]"].startswith("question_of_interest, context_of_use, ")
+    optional = "Optional details of the report that are not given: "
+    where = "A study file written by `mrstrain init` lists the keys."
+    assert told("") == [f"{optional}12 of 12 in [acquisition], 26 of 26 in [credibility]. {where}"]
     (study / "Load0.json").write_text('{"FlipAngle": 12}')  # of dcm2niix
-    more = '[acquisition]\nsnr = 20.0\n[credibility]\nquestion_of_interest = "Which?"\n'
-    (study / "study.toml").write_text(STUDY.replace('"mine.toml", ', "") + more)
-    after = told()
-    assert set(before["[acquisition]"].split(", ")) - set(after["[acquisition]"].split(", ")) == {
-        "snr",
-        "flip_angle_deg",
-    }
-    assert after["[credibility]"].startswith("context_of_use, ")
+    more = '[acquisition]\nsnr = 20.0\n[credibility]\nquestion_of_interest = "Which?"\nlevel_use_error = "b"\n'
+    assert told(more) == [f"{optional}10 of 12 in [acquisition], 24 of 26 in [credibility]. {where}"]
+    chosen = {"model_influence": "low", "decision_consequence": "low", "model_risk": "low"}
+    words = {name: chosen.get(name, "some") for name in CredibilityOptions.model_fields}
+    said = "[credibility]\n" + "".join(f'{name} = "{text}"\n' for name, text in words.items())
+    assert told(said) == [f"{optional}11 of 12 in [acquisition]. {where}"]
     (study / "Load1.nii.gz").unlink()
     ill = check(study)
     assert ill.wrong  # is all that is told
-    assert not any(note.startswith("Not given") for note in ill.notes)
+    assert not any(note.startswith("Optional") for note in ill.notes)
+    assert ill.summary()[-1].startswith("ERROR: ")
+    assert not any("No problems found" in line for line in ill.summary())
+
+
+def test_warnings_are_counted_where_no_problem_is_found(study):
+    values = np.ones(GRID.shape, dtype=np.int64)
+    values[:4], values[4:6] = 2, 3
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 3: "talus"}))
+    whole = ('"mine.toml", "friedman"', '"akrami"')  # which has one material for all tissues
+    assert wrong(study, ("[mesh]", '[mesh]\nbones = ["bone"]'), whole) == ""
+    assert check(study).summary()[-1].startswith("No problems found, but 1 warning above. Next step: mrstrain run ")
+
+
+def test_images_on_one_grid_stand_in_one_line_and_another_grid_is_seen(study):
+    def told() -> list[str]:
+        return [note for note in check(study).notes if "voxels of" in note]
+
+    box = "x -7.0 to 25.0, y -7.0 to 25.0, z -7.0 to 25.0 mm (LPS)"
+    assert told() == [f"Load0, Load1: 16 x 16 x 16 voxels of 2 x 2 x 2 mm; {box}"]
+    moved = replace(GRID, origin_mm=GRID.origin_mm + 1.0)
+    write_image(study / "Load1.nii.gz", Image(moved, read_image(study / "Load1.nii.gz").values))
+    assert [note.partition(": ")[0] for note in told()] == ["Load0", "Load1"]
 
 
 def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
@@ -269,10 +290,10 @@ def test_a_run_refuses_before_it_begins_what_all_of_it_needs(study, monkeypatch)
             with pytest.raises(InputError, match=f"(?s)cannot be run.*Heel: .*{told}"):
                 begin(study)
         if "bone =" not in change[1]:
-            assert forecast(study, only=("register",))["register Load1"] == "run"
+            assert forecast(study, only=("register",))["register Load1"] == "will run"
     assert not (study / "results").exists()
     (study / "study.toml").write_text(STUDY.replace("labels =", 'bone = "calcaneuz"\nlabels ='))
-    assert forecast(study, only=("mesh", "simulate"))["simulate friedman"] == "run"
+    assert forecast(study, only=("mesh", "simulate"))["simulate friedman"] == "will run"
 
 
 def test_stages_are_refused_by_what_they_need_and_not_by_what_others_do(study):
@@ -281,7 +302,7 @@ def test_stages_are_refused_by_what_they_need_and_not_by_what_others_do(study):
             what = forecast(study, only=only)
         except InputError as wrong:
             return str(wrong)
-        assert "run" in what.values()
+        assert "will run" in what.values()
         return ""
 
     values = np.full(GRID.shape, 9)
@@ -307,7 +328,7 @@ def test_an_image_that_all_registrations_read_is_refused_where_it_is_damaged(stu
     with pytest.raises(InputError, match=f"(?s)cannot be run.*{name}"):
         forecast(study, only=("register",))
     if name == "Load0":
-        assert forecast(study, only=("mesh",))["mesh"] == "run"
+        assert forecast(study, only=("mesh",))["mesh"] == "will run"
 
 
 def test_what_is_meshed_is_looked_at_as_it_is(study):
@@ -350,7 +371,7 @@ def test_gaps_are_left_out_where_the_study_says_so(study):
     assert "level = true needs an unloaded image without" in wrong(study, masked, level)
     with pytest.raises(InputError, match="level = true"):
         forecast(study)
-    assert forecast(study, only=("register",))["register Load1"] == "run"
+    assert forecast(study, only=("register",))["register Load1"] == "will run"
 
 
 def test_a_run_of_another_code_that_ended_early_is_told_and_may_be_asked_for(study):

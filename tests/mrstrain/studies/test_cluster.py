@@ -140,7 +140,9 @@ def test_a_stage_whose_worker_is_killed_is_tried_once_more_when_it_is_alone(tmp_
             name, outcome, _ = ended.result(timeout=300)
     assert name == "killed"
     assert outcome.startswith("Its worker process died: the system ended it, most often for lack of memory")
-    assert outcome.endswith("It was tried once more, alone; by the estimate it needs 1.5 GiB of memory.")
+    assert outcome.endswith(
+        "A second attempt, with no other stage running, failed too; its estimated memory need is 1.5 GiB."
+    )
 
 
 def test_stages_that_waited_for_a_worker_that_is_killed_go_to_another(tmp_path):

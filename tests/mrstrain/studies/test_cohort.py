@@ -41,8 +41,8 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
     doubted = re.sub(r'"level":"(trust|caution)"', '"level":"distrust"', ledger.read_text())
     ledger.write_text(StageRecord.model_validate_json(doubted).sealed().model_dump_json())
     doubtful = [note for note in cohort(places, out=tmp_path / "cohort").notes if "Do not trust" in note]
-    assert [note.split(",")[0] for note in doubtful] == [
-        "Ben: the verdict on the registration of Load1 is Do not trust"
+    assert [note.split(";")[0] for note in doubtful] == [
+        "Ben: the registration of Load1 has the verdict 'Do not trust'"
     ]
     with pytest.raises(InputError, match="different names"):
         cohort([places[0], places[0]], out=tmp_path / "cohort")

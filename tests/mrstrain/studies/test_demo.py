@@ -102,14 +102,16 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     errors = {x.name: (TissueError("fat", 9, 0.1, 0.44, 0.0221, 0.0, 0.1, 0.1, 0.2, 0),) for x in LOADS}
     lines = _summary(errors, StudyRun(study, outcomes))
     assert len(lines) == 5
-    assert "Load1 trust" in lines[0]
-    assert "Load3 use with care" in lines[0]
-    assert "Load4 0.022 of 0.44" in lines[1]
+    assert lines[0].startswith("Registration verdicts: ")
+    assert "Load1: Trust" in lines[0]
+    assert "Load3: Use with care" in lines[0]
+    assert lines[1].startswith("RMS error of the max. shear in fat (true 95th percentile in brackets): ")
+    assert "Load4 0.022 (0.44)" in lines[1]
     assert lines[2:4] == ["All loads, area in mL: trebbi 2.5", "Best match over all loads (area metric): trebbi."]
     assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
     outcomes["simulate erdemir"] = ended("simulate erdemir", "erdemir, Load1: ONLY 75% of the load", complete=False)
     lines = _summary(errors, StudyRun(study, outcomes))
-    assert lines[4] == "simulate erdemir: in part. erdemir, Load1: ONLY 75% of the load"
+    assert lines[4] == "simulate erdemir: partial. erdemir, Load1: ONLY 75% of the load"
     assert lines[5].startswith("Report: ")
 
 
@@ -145,8 +147,8 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     found = [what for case, what, fraction in told if case == "register Load2" and fraction == 1.0]
     assert re.fullmatch(r"max\. shear in \w+ [\d.]+ median, [\d.]+ at the 95th percentile; .*", *found)
     assert not shown.complete  # the rest has no result
-    assert shown.lines[0].startswith("Verdicts on the registrations: Load2 ")
-    error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) of ([\d.]+)", shown.lines[1]).groups())
+    assert shown.lines[0].startswith("Registration verdicts: Load2: ")
+    error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) \(([\d.]+)\)", shown.lines[1]).groups())
     assert 0.0 < error < 0.5 * true
     labels = read_labels(tmp_path / "demo" / "tissues.nii.gz", tmp_path / "demo" / "tissues.csv")
     valid = read_mask(tmp_path / "demo" / "results" / "registration" / "Load2" / "valid.nii.gz").inside

@@ -165,7 +165,10 @@ def test_chained_loads_wait_for_one_another(tmp_path):
 
 def test_a_simulated_load_needs_its_force(tmp_path):
     text = WHOLE.replace("normal_n = 15.0\n", "")
-    with pytest.raises(InputError, match=r"(?s)Shear needs a normal load.*\n  line 10: \[loads.Load2\] 'normal_n'"):
+    with pytest.raises(
+        InputError,
+        match=r"(?s)Shear needs a normal force or plate displacement as well.*\n  line 10: \[loads.Load2\] 'normal_n'",
+    ):
         plan(read_study(written(tmp_path, text)))
     alone = text.replace("shear_n = 45.0\n", "") + "level = true\n"
     stages = {stage.name: stage for stage in plan(read_study(written(tmp_path, alone)))}
@@ -173,7 +176,8 @@ def test_a_simulated_load_needs_its_force(tmp_path):
     assert {name for name in stages if name.startswith("level trebbi")} == {"level trebbi Load1"}
     assert "register Load2" in stages  # measured all the same
     with pytest.raises(
-        InputError, match=r"(?s)at least one load with a normal load.*line 7: \[loads.Load1\].*line 9: \[loads.Load2\]"
+        InputError,
+        match=r"(?s)No load has a normal force or plate displacement.*line 7: \[loads.Load1\].*line 9: \[loads.Load2\]",
     ):
         plan(read_study(written(tmp_path, alone.replace("normal_n = 140\n", ""))))
     measured = text.replace('sets = ["trebbi", "luboz"]', "sets = []")

@@ -68,7 +68,7 @@ def test_names_that_a_laboratory_gives_are_recognised(tmp_path):
 
 def test_names_that_would_be_recognised_are_listed_beside_those_that_are_not(tmp_path):
     told = init(folder_of(tmp_path, "Load0.nii.gz", "pressed.nii.gz")).summary()
-    assert "NAME_140N" in next(line for line in told if line.startswith("Names that do"))
+    assert "NAME_140N" in next(line for line in told if line.startswith("Recognised names: "))
 
 
 def test_two_unloaded_images_are_refused(tmp_path):
@@ -80,7 +80,7 @@ def test_without_a_label_map_it_says_how_to_measure_all_the_same(tmp_path):
     told = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "Load2.nii.gz")).summary()
     images = " ".join(f"{tmp_path}/Load{n}.nii.gz" for n in range(3))
     command = f"mrstrain register {images} --bone BONE.nii.gz --out {tmp_path}/results"
-    assert f"The mask is also enough to measure without labels: {command}" in told
+    assert f"To measure strain without a label map, the mask of the bone alone is sufficient: {command}" in told
     assert any(line.startswith("Without a label map") and 'labels = "auto"' in line for line in told)
     assert not any("Without a label map" in line for line in NewStudy(tmp_path / "study.toml", LABELLED, "").summary())
 
@@ -124,7 +124,12 @@ def test_every_key_of_a_study_file_stands_in_it_with_its_default(tmp_path, names
         keys = keys_of(model)
         assert set(tables[table]) == set(keys), table
         for key, line in tables[table].items():
-            (value,) = tomllib.loads(line).values()  # each is TOML once the # is taken away
+            if key == "normal_n":  # a number is to be put in before the # is taken away
+                assert line.startswith("normal_n = ... ")
+                with pytest.raises(tomllib.TOMLDecodeError):
+                    tomllib.loads(line)
+                continue
+            (value,) = tomllib.loads(line).values()  # each other is TOML once the # is taken away
             default = keys[key].get_default()
             if table == "uncertainty":  # without a table all inputs are exact; a new study begins with usual spreads
                 assert value == SPREADS.get(key, default) or key in ("stiffness", "variants"), key
@@ -149,10 +154,25 @@ def test_every_force_that_is_to_be_put_in_is_told_with_its_line_by_init_and_by_c
     first, second = (number for number, line in enumerate(lines, start=1) if line.startswith("# normal_n ="))
     told = [line.strip().split(" = ")[0] for line in begun.summary()[-5:-2]]
     assert told == ["line 12: names", f"line {first}: normal_n", f"line {second}: normal_n"]
-    assert 'force under "Load 1", N' in begun.summary()[-4]
+    assert 'normal force of "Load 1", N' in begun.summary()[-4]
     places = [f"line {first}: [loads.Load 1] 'normal_n'", f"line {second}: [loads.Load2] 'normal_n'"]
     (told,) = (one for one in check(tmp_path).wrong if "normal_n" in one)
     assert [line.strip() for line in told.splitlines()[1:]] == places
+
+
+def test_no_force_is_taken_from_the_published_experiment_by_removing_a_hash(tmp_path):
+    begun = init(folder_of(tmp_path, "Load0.nii.gz", "Load3.nii.gz", "other-load-5.nii.gz", "tissues.nii.gz"))
+    text = begun.path.read_text()
+    assert 'normal force of "Load3", N (15.0 in the published experiment)' in text
+    assert "shear force, N (45.0 in the published experiment)" in text
+    uncommented = re.sub(r"^# (normal_n|shear_n) = ", r"\1 = ", text, flags=re.MULTILINE)
+    begun.path.write_text(uncommented)
+    with pytest.raises(
+        InputError, match=r"(?s)not valid TOML.*normal_n = \.\.\.  .*FILL IN.*normal_n = \.\.\.  .*FILL IN"
+    ):
+        read_study(tmp_path)
+    begun.path.write_text(re.sub(r"^normal_n = \.\.\.", "normal_n = 8.0", uncommented, flags=re.MULTILINE))
+    assert {(load.normal_n, load.shear_n) for load in read_study(tmp_path).loads.values()} == {(8.0, 0.0)}
 
 
 def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
@@ -199,7 +219,9 @@ def heel_in(folder: Path, pair) -> Path:
 def test_a_picture_shows_what_was_found(tmp_path, tiny_pair):
     begun = init(heel_in(tmp_path, tiny_pair))
     assert begun.picture == tmp_path / "study.png"
-    assert begun.summary()[-1] == f"Picture of the images found: {tmp_path / 'study.png'}"
+    assert begun.summary()[-2:] == [
+        f"Check the picture of the images found: {tmp_path / 'study.png'}", f"Next step: mrstrain check {tmp_path}",
+    ]  # fmt: skip
     with Pixels.open(begun.picture) as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     assert pixels.shape[0] > 600  # two rows: the unloaded image in three planes, and two loads
@@ -211,10 +233,12 @@ def test_no_picture_is_no_reason_to_write_no_study_file(tmp_path):
     begun = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "tissues.nii.gz"))
     assert begun.path.is_file()
     assert not (tmp_path / "study.png").exists()
-    assert re.fullmatch(r"Picture of the images found: none, .*Load0\.nii\.gz.*", begun.summary()[-1])
+    assert re.fullmatch(r"Picture of the images found: none, .*Load0\.nii\.gz.*", begun.summary()[-2])
     (tmp_path / "study.toml").unlink()
     (tmp_path / "Load0.nii.gz").unlink()
-    assert init(tmp_path).summary()[-1] == "Picture of the images found: none, no unloaded image was found"
+    assert init(tmp_path).summary()[-2:] == [
+        "Picture of the images found: none, no unloaded image was found", f"Next step: mrstrain check {tmp_path}",
+    ]  # fmt: skip
 
 
 def test_labels_that_lie_elsewhere_are_left_out_of_the_picture(tiny_pair):
@@ -257,10 +281,11 @@ def test_answers_stand_in_the_study_file(tmp_path, tiny_pair, capsys):
         place, "heel", "ankle", "-5", "abc", "140 N", "", "15", "-45,5", "0 0.1 -1", "1 0", "[0, 1, 0]"
     )
     assert [question.split(",")[0].split(" [")[0] for question in asked] == [
-        *["Bone: its label (bone"] * 2, *["Load1: normal force"] * 3, "Load1: shear force", "Load2: normal force",
-        "Load2: shear force", "Plate: outward normal", *["Plate: direction of the shear force on the tissue"] * 2,
+        *["Which label is the bone (bone"] * 2, *["Load1: normal force"] * 3, "Load1: shear force",
+        "Load2: normal force", "Load2: shear force", "Direction from the body to the plate",
+        *["Direction of the shear force on the tissue"] * 2,
     ]  # fmt: skip
-    assert asked[0].endswith("or the file of its mask [bone]: ")
+    assert asked[0].endswith("), or which file is its mask? [bone]: ")
     told = capsys.readouterr().out
     assert "'heel': choose one of bone, fat" in told
     assert "'-5': the normal force must be positive (compression)." in told
@@ -308,7 +333,9 @@ def test_a_terminal_is_asked_and_a_pipe_is_not(tmp_path, tiny_pair, options, ask
     assert process.wait() == 0, told
     assert (b"Load1: normal force, N [later]: " in told) == asks
     assert read_study(place).loads["Load1"].normal_n == (140.0 if asks else None)
-    assert b"Picture of the images found: " in told[told.rindex(b"Picture") :].replace(b"\r\n  ", b" ")
+    end = told[told.rindex(b"Check the picture") :].replace(b"\r\n  ", b" ")
+    assert b"Check the picture of the images found: " in end
+    assert b"Next step: mrstrain check " in end
     if asks:
         (place / "study.toml").unlink()
         piped = subprocess.run(command, input="", capture_output=True, text=True, check=True)

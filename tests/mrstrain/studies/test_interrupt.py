@@ -87,8 +87,8 @@ def test_a_study_ends_and_goes_on(images, tmp_path, group):
     interrupted(command, tmp_path / "err.txt", lambda _: under_way(records, "register Load1"), group=group)
     assert (records / "register repeat.json").is_file()
     told = forecast(study, only=["register"])
-    assert told["register repeat"] == "done already"
-    assert told["register Load1"] == "run"
+    assert told["register repeat"] == "up to date"
+    assert told["register Load1"] == "will run"
     assert "interrupted" in (study / "results" / "report.html").read_text().lower()
 
 

@@ -107,7 +107,7 @@ def measuring_accuracy(made: Path) -> Killed:
 
 def running_a_cohort(made: Path) -> Killed:
     def left(out: Path) -> None:
-        assert forecast(out / "study")["compare"] == "run"
+        assert forecast(out / "study")["compare"] == "will run"
         assert not (out / "cohort.csv").exists()
 
     def begun(out: Path) -> bool:

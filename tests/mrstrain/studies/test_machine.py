@@ -176,7 +176,7 @@ def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path
     assert machine.begun == ["big", "small", "other", "next", "big"]
     assert list(ended) == ["small", "other", "next", "big"]
     expected = (
-        "It died. It was tried once more, alone; by the estimate it needs 2.3 GiB of memory."
+        "It died. A second attempt, with no other stage running, failed too; its estimated memory need is 2.3 GiB."
         if deaths == 2
         else "This was computed at the second attempt. It died."
     )
@@ -242,7 +242,7 @@ def test_a_worker_without_memory_for_a_stage_counts_as_a_process_that_died(tmp_p
     runner.begin("mesh", "mesh", {}, tmp_path / "lock")
     _, outcome, _ = runner.next()
     assert outcome.startswith("The memory ran out (can't start new thread). Free memory")
-    assert "tried once more, alone" in outcome
+    assert "A second attempt, with no other stage running, failed too" in outcome
 
 
 def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):

@@ -98,7 +98,7 @@ def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(stu
     assert not StudyRun(study, broken).complete
 
     part = ended(study, **sound, mesh=SOUND, simulate_trebbi=StageResult((), complete=False))
-    assert "Incomplete: simulate trebbi: in part." in head(page_of(study, part))
+    assert "Incomplete: simulate trebbi: partial." in head(page_of(study, part))
     assert not StudyRun(study, part).complete
 
 

@@ -184,7 +184,7 @@ def test_only_and_force(folder):
 @pytest.mark.parametrize(
     ("only", "force", "says"),
     [
-        (("registr",), (), "There is no stage 'registr'. The stages are: register a"),
+        (("registr",), (), "no stage or kind of stage 'registr'. Kinds in this study: register, .*Stages: register a"),
         (("register",), ("mesh",), r"force \(mesh\) has no effect, because only \(register\) excludes this stage"),
         (("register a",), ("register b",), r"force \(register b\) has no effect"),
     ],
@@ -255,24 +255,24 @@ def test_the_forecast_knows_what_cannot_be_run(folder):
     def told(only: tuple[str, ...]) -> dict[str, str]:
         return Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=only).forecast()
 
-    assert told(("simulate",))["simulate a"] == "cannot be run: mesh has no result."
-    assert told(("compare",))["compare"].startswith("cannot be run: none of register a")
-    assert told(("mesh", "simulate"))["simulate a"] == "run"
-    assert told(("register", "compare"))["compare"] == "run"
+    assert told(("simulate",))["simulate a"] == "cannot run: mesh has no result."
+    assert told(("compare",))["compare"].startswith("cannot run: none of register a")
+    assert told(("mesh", "simulate"))["simulate a"] == "will run"
+    assert told(("register", "compare"))["compare"] == "will run"
     ran(folder, failing=("mesh",))
-    assert told(("compare",))["compare"] == "done already"  # of the measurements alone, as a run takes it
+    assert told(("compare",))["compare"] == "up to date"  # of the measurements alone, as a run takes it
     ran(folder)
-    assert set(told(("compare",)).values()) == {"left out", "done already"}
+    assert set(told(("compare",)).values()) == {"not requested", "up to date"}
     (folder / "results" / ".study" / "mesh.json").unlink()
-    assert told(("simulate",))["simulate a"] == "cannot be run: mesh has no result."
-    assert told(("compare",))["compare"] == "run"  # models that a mesh is lost of are no result any more
+    assert told(("simulate",))["simulate a"] == "cannot run: mesh has no result."
+    assert told(("compare",))["compare"] == "will run"  # models that a mesh is lost of are no result any more
     assert "compare" in ran(folder, only=("compare",))[0]
 
 
 def test_the_forecast_is_what_is_run(folder):
     def forecast(number: int = 1, **how) -> list[str]:
         told = Pipeline(stages_in(folder, number), Ledger(folder / "results", folder), **how).forecast()
-        return [name for name, what in told.items() if what == "run"]
+        return [name for name, what in told.items() if what == "will run"]
 
     assert forecast() == ALL
     assert not (folder / "results" / "mesh").exists()

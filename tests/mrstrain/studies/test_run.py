@@ -90,7 +90,7 @@ def test_every_result_is_there_and_the_report_tells_it(done):
     ):
         assert re.search(rf"^{stage}: {found}.* \(\d of 6 stages after .*\)$", stderr, re.M), stage
     assert re.search(r"^mesh: .*, about \d+ (s|min) left\)$", stderr, re.M)
-    assert re.search(r"^finished: 6 of 6 stages after \d+ (s|min)$", stderr, re.M)
+    assert re.search(r"^finished after \d+ (s|min): 6 of 6 stages$", stderr, re.M)
     log = (out / "study.log").read_text()
     assert all(f"{stage}: done after" in log for stage in STAGES)
     assert re.search(r"To do: 6 of 6 stages, about \d+ (s|min) on \d+ cores, [\d.]+ GiB of memory", log)
@@ -112,7 +112,7 @@ def test_parameter_files_are_inputs_of_every_registration(images, tmp_path):
 def test_run_again_does_nothing_in_under_ten_seconds(done):
     folder, *_ = done
     before = (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns
-    assert set(forecast(folder).values()) == {"done already"}
+    assert set(forecast(folder).values()) == {"up to date"}
     began = time.process_time()  # a busy machine makes it no longer, as the clock would
     outcomes = run(folder).outcomes
     assert time.process_time() - began < 10.0
@@ -152,12 +152,12 @@ def test_only_what_changed_is_done_anew(done, tmp_path):
     shutil.copytree(folder, study)
     change(study, ("normal_n = 8.0", "normal_n = 6.0"))
     told = forecast(study)
-    assert [name for name, what in told.items() if what == "run"] == ["simulate akrami", "compare"]
+    assert [name for name, what in told.items() if what == "will run"] == ["simulate akrami", "compare"]
     image = read_image(study / "Load2.nii.gz")
     values = image.values.copy()
     values[0, 0, 0] += 1.0
     write_image(study / "Load2.nii.gz", type(image)(image.grid, values))  # the same shape, and nearly the same size
-    assert [name for name, what in forecast(study).items() if what == "run"] == [
+    assert [name for name, what in forecast(study).items() if what == "will run"] == [
         "register Load2", "simulate akrami", "compare",
     ]  # fmt: skip
 
@@ -214,7 +214,7 @@ def test_killed_in_any_stage_and_run_again_gives_the_same(done, tmp_path, stage)
     assert not (records / f"{stage}.json").exists()
     assert stage != "register Load1" or not (study / "results" / "registration" / "Load1").exists()
     told = forecast(study)
-    assert [name for name in STAGES if told[name] == "run"] == left
+    assert [name for name in STAGES if told[name] == "will run"] == left
     of_all: list[float] = []
     ended: list[str] = []
 
@@ -266,7 +266,7 @@ def test_a_registration_whose_process_is_killed_is_tried_once_more(done, tmp_pat
         kill(load)
     told, _ = process.communicate(timeout=400)
     assert process.returncode == 1
-    assert "tried once more, alone" in told
+    assert "A second attempt, with no other stage running, failed too" in " ".join(told.split())
     assert "register Load1: FAILED" in told
     assert "register Load2: FAILED" not in told
     assert "died (exit code SIGKILL(-9))" in told
@@ -277,7 +277,7 @@ def test_a_registration_whose_process_is_killed_is_tried_once_more(done, tmp_pat
     assert np.array_equal(shear_of(study, "Load2"), shear_of(folder, "Load2"), equal_nan=True)
     assert "register Load1: failed" in (study / "results" / "report.html").read_text()
     next_time = forecast(study, only=["register"])
-    assert (next_time["register Load1"], next_time["register Load2"]) == ("run", "done already")
+    assert (next_time["register Load1"], next_time["register Load2"]) == ("will run", "up to date")
 
 
 @pytest.mark.full_size
@@ -310,6 +310,7 @@ def test_check_tells_all_that_is_wrong_at_once(done, images, tmp_path):
     assert fine.wrong == ()
     assert any(f"To do: {len(STAGES)} of {len(STAGES)} stages" in note for note in fine.notes)
     assert "All stages are up to date" in check(done[0]).notes[-1]
+    assert check(done[0]).summary()[-1] == "No problems found."
     study = tmp_path / "study"
     shutil.copytree(images, study)
     shutil.copy(study / "Load0.nii.gz", study / "Load1.nii.gz")

@@ -96,7 +96,7 @@ def test_check_tells_the_further_solutions_and_a_tissue_that_is_not_there(varied
     told = "\n".join(check(varied).summary())
     assert "2 stages give the input uncertainty of the models and take about" in told
     assert "`mrstrain run --quick` skips them" in told
-    assert forecast(varied, quick=True)["compare"] == "run"
+    assert forecast(varied, quick=True)["compare"] == "will run"
     assert "vary akrami" not in forecast(varied, quick=True)
     text = (varied / "study.toml").read_text()
     (varied / "study.toml").write_text(text.replace("{ fat = 0.2 }", "{ brawn = 0.2 }"))

@@ -202,7 +202,7 @@ def test_mixed_series_are_listed_and_chosen_from(tmp_path: Path, monkeypatch: py
     folder = _series(tmp_path / "s")
     for k in range(_SLICES):
         _write(folder, k, name=f"other{k}.dcm", SeriesInstanceUID=_OTHER, EchoTime="50", RescaleSlope="2")
-    with pytest.raises(InputError, match="has 2 DICOM series") as caught:
+    with pytest.raises(InputError, match="contains 2 DICOM series") as caught:
         read_image(folder)
     message = str(caught.value)
     assert "111111: 8 slices of 5 x 6, echo time 6.3 ms" in message

@@ -160,7 +160,7 @@ def test_several_images_in_a_file_are_listed_and_chosen_from(tmp_path: Path, oth
     moved, other = other.get("at", 0.0), {name: value for name, value in other.items() if name != "at"}
     both = [g for k in SHUFFLED for g in (groups(k), groups(k, at=k + moved, scaling=("3", "0"), **other))]
     path = write_enhanced(tmp_path / "e" / "e.dcm", both)
-    message = refused(path, "the file has several echoes, image types, orientations, stacks or time p", InputError)
+    message = refused(path, "this file contains several echoes, image types, orientations, stacks or time", InputError)
     lines = message.splitlines()[1:]
     assert [line.split(":")[0].strip() for line in lines] == ["111111/1", "111111/2"]
     assert "8 slices of 5 x 6" in lines[0]
@@ -170,7 +170,7 @@ def test_several_images_in_a_file_are_listed_and_chosen_from(tmp_path: Path, oth
         np.testing.assert_array_equal(read_image(path, series=f"111111/{own}").values, 3.0 * STORED)
     np.testing.assert_array_equal(read_image(path.parent, series=f"111111/{3 - own}").values, STORED)
     refused(path, "matches 0 of the DICOM series", InputError, series="111111/3")
-    refused(path.parent, "the folder has several", InputError)
+    refused(path.parent, "this folder contains several", InputError)
 
 
 def test_a_long_list_is_shortened_and_all_of_it_can_be_chosen(tmp_path: Path) -> None:
@@ -233,7 +233,7 @@ def test_an_image_in_several_files(tmp_path: Path) -> None:
 def test_a_folder_with_a_file_for_each_time_point(tmp_path: Path) -> None:
     for t in (1, 2):
         write_enhanced(tmp_path / "e" / f"{t}.dcm", [groups(k, time=t) for k in SHUFFLED], offset=t)
-    message = refused(tmp_path / "e", "the folder has several", InputError)
+    message = refused(tmp_path / "e", "this folder contains several", InputError)
     assert re.findall(r"time point (\d)", message) == ["1", "2"]
     np.testing.assert_array_equal(read_image(tmp_path / "e", series="111111/2").values, STORED + 2.0)
     for t in (1, 2):

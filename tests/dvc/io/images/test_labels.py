@@ -336,14 +336,14 @@ class TestFitMask:
         grid = Grid((40, 44, 48), (1.0, 1.2, 0.9), (-18.0, -24.0, -20.0))
         mirrored = Grid(grid.shape, grid.spacing_mm, grid.origin_mm * flip, grid.direction * flip[:, None])
         mask = Mask(mirrored, _ball(grid, 6.0, np.array([3.0, 4.0, 2.0])))
-        with pytest.raises(GeometryError, match="RAS and LPS were confused"):
+        with pytest.raises(GeometryError, match="RAS and LPS coordinates were mixed up"):
             fit_mask(mask, grid)
 
     def test_of_an_image_that_is_its_own_mirror_image_the_usual_mistake_is_named(self) -> None:
         grid = Grid((40, 45, 48), (1.0, 1.0, 0.9), (-18.0, -22.0, -20.0))  # y runs from -22 to 22 mm
         flip = np.array([-1.0, -1.0, 1.0])
         mirrored = Grid(grid.shape, grid.spacing_mm, grid.origin_mm * flip, grid.direction * flip[:, None])
-        with pytest.raises(GeometryError, match="the signs of x and y reversed"):
+        with pytest.raises(GeometryError, match="with x and y negated: RAS and LPS"):
             fit_mask(Mask(mirrored, _ball(grid, 6.0, np.array([3.0, 4.0, 2.0]))), grid)
 
     def test_nothing_left_on_a_coarse_grid(self) -> None:

@@ -177,7 +177,7 @@ def test_units_that_do_not_exist_are_refused(tmp_path: Path, code: int) -> None:
 def test_a_volume_of_a_4d_file(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     series = np.random.default_rng(1).normal(size=(5, 6, 7, 3)).astype(np.float32)
     path = _save(tmp_path / name, values=series)
-    with pytest.raises(ImageFileError, match=r"has 3 volumes.* with N from 0 to 2") as caught:
+    with pytest.raises(ImageFileError, match=r"contains 3 volumes.* with N from 0 to 2") as caught:
         read_image(path)
     command = re.search(r"dvc\.write_image\(.*\)\)", str(caught.value))
     assert command is not None

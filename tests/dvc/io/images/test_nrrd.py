@@ -180,7 +180,7 @@ def test_a_volume_of_a_4d_nrrd(tmp_path: Path, axis: str) -> None:
         space_directions=f"none {directions}" if axis == "first" else f"{directions} none",
         kinds="list domain domain domain" if axis == "first" else "domain domain domain list",
     )
-    with pytest.raises(ImageFileError, match="has 3 volumes"):
+    with pytest.raises(ImageFileError, match="contains 3 volumes"):
         read_image(path)
     np.testing.assert_array_equal(read_image(path, volume=2).values, _VALUES * 3)
 

@@ -265,7 +265,7 @@ def test_real_files_agree_with_simpleitk(
 
 
 def test_a_real_4d_file_is_refused_with_its_number_of_volumes(real_data: Path) -> None:
-    with pytest.raises(ImageFileError, match=r"has 2 volumes, but one is needed.*volume=N.* with N from 0 to 1"):
+    with pytest.raises(ImageFileError, match=r"contains 2 volumes; one is needed.*volume=N.* with N from 0 to 1"):
         read_image(real_data / "brain-pair" / "example4d.nii.gz")
 
 

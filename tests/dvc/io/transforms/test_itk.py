@@ -196,7 +196,7 @@ def _does_not_end(_: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("reader", "most_s", "message"), [(_dies, 60.0, "ended the process"), (_does_not_end, 0.5, "does not end")]
+    ("reader", "most_s", "message"), [(_dies, 60.0, "ended the process"), (_does_not_end, 0.5, "timed out")]
 )
 def test_a_file_that_harms_its_reader_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: Callable[[Path], None], most_s: float, message: str
