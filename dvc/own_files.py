@@ -76,7 +76,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     return [dict(zip(head, row, strict=True)) for row in rows]
 
 
-_NESTED = "nested too deeply"
+_NESTED = "its brackets are nested too deeply"
 
 
 def _refused(word: str) -> NoReturn:
