@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
+from dvc.errors import ImageFileError
 from dvc.io.meshes.calculix import is_closed, time_reached as time_in_frd
 from dvc.io.meshes.febio import time_reached as time_in_xplt
 
@@ -22,12 +23,13 @@ class EarlyEnd(NamedTuple):
 
 
 def early_end(place: Path) -> EarlyEnd | None:
-    """Why the run that wrote a result (.xplt or .vtk of FEBio, .frd) may have ended early; None where nothing says so.
+    """Why the run that wrote a result may have ended early; None where nothing says so.
 
-    FEBio says in its log how a run ended, and at what time. Without a log, and for CalculiX, the time of the last state
-    is compared with the time of all steps in the deck. These files lie beside the result and have its name, for .vtk
-    without the number of the state. Without a deck, CalculiX' result must have its last line. ImageFileError for a
-    damaged result.
+    FEBio (.xplt, .vtk) says in its log how a run ended, and at what time. Without a log, and for CalculiX (.frd), the
+    time of the last state is compared with the time of all steps in the deck. These files lie beside the result and
+    have its name, for .vtk without the number of the state. Without a deck, CalculiX' result must have its last line.
+    What was exported from a run (.vtu, .msh, .csv) is judged by the result, log or status file (.sta) of the same name.
+    ImageFileError for a damaged result.
     """
     kind = place.suffix.lower()
     if kind in (".xplt", ".vtk"):
@@ -56,7 +58,25 @@ def early_end(place: Path) -> EarlyEnd | None:
             reason = f"did not finish: its result has no last line (9999), and it stopped at time {time:g}"
             return EarlyEnd(reason, certain=True)
         return _compared(time, whole, f"{place.stem}.inp")
-    return None
+    return _of_the_run_beside(place)
+
+
+def _of_the_run_beside(place: Path) -> EarlyEnd | None:
+    """The end of the run from which a file was exported."""
+    for result in map(place.with_suffix, (".xplt", ".frd")):
+        if result.is_file():
+            try:
+                return early_end(result)
+            except ImageFileError:  # it is not what is compared
+                return None
+    log, status, deck = map(place.with_suffix, (".log", ".sta", ".inp"))
+    if "E R R O R   T E R M I N A T I O N" in _ends_of(log):
+        return EarlyEnd(f"ended with ERROR TERMINATION ({log.name})", certain=True)
+    said = _ends_of(status)
+    if "THE ANALYSIS HAS NOT BEEN COMPLETED" in said:  # Abaqus
+        return EarlyEnd(f"was not completed ({status.name})", certain=True)
+    *_, last = (None, *re.findall(r"^(?:\s+\d+){4}\s+([.\dE+-]+)\s+[.\dE+-]+\s+[.\dE+-]+\s*$", said, re.MULTILINE))
+    return None if last is None else _compared(float(last), _calculix_time(deck), deck.name)
 
 
 def _compared(time: float | None, whole: float | None, deck: str) -> EarlyEnd | None:

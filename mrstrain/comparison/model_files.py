@@ -99,6 +99,9 @@ def with_variants(
         chosen, reached = _chosen(place, [load])[1] if place.is_dir() else {}, _outcome(place, "reached")
         if load not in chosen or (reached is not None and reached.get(load, 0.0) < 1.0):
             return None
+        if (end := early_end(chosen[load])) and end.certain and not usual.unfinished:
+            notes.append(f"{chosen[load]}: the run {end.reason}; this solution is not used.")
+            return None
         return ModelFile(model, chosen[load], *_reading(place, usual, to_image))
 
     def with_own(model: ModelFile, load: str) -> ModelFile:

@@ -255,6 +255,36 @@ def test_the_time_of_a_deck(folder: Path, tmp_path: Path, steps: str, early: boo
     assert end is None or end.certain == bool(early)
 
 
+@pytest.mark.parametrize("ending", [".vtu", ".csv", ".msh"])
+def test_what_was_exported_from_a_run_is_judged_by_what_lies_beside_it(
+    folder: Path, tmp_path: Path, ending: str
+) -> None:
+    def end(*files: str) -> tuple[str, bool] | None:
+        for old in tmp_path.iterdir():
+            old.unlink()
+        for name in files:
+            shutil.copy(folder / name, tmp_path / f"Load1{Path(name).suffix}")
+        (tmp_path / f"Load1{ending}").write_text("exported")
+        return early_end(tmp_path / f"Load1{ending}")
+
+    assert end() is end("febio/hex8.xplt", "febio/hex8.log") is end("calculix/c3d4.frd", "calculix/c3d4.inp") is None
+    assert end("febio/fails.xplt", "febio/fails.log", "febio/fails.feb") == (EARLY["febio/fails.xplt"].replace(
+        "fails", "Load1"), True)  # fmt: skip
+    assert end("febio/fails.log") == ("ended with ERROR TERMINATION (Load1.log)", True)
+    assert end("calculix/incs.frd", "calculix/incs.inp") == ("ended at time 0.4 of 1 (Load1.inp)", True)
+    end("calculix/incs.inp")
+    increments = [f"     1          {n}     1     2  0.{n}00000E+00  0.{n}00000E+00  0.100000E+00\n" for n in (3, 4)]
+    status = tmp_path / "Load1.sta"
+    status.write_text("SUMMARY OF JOB INFORMATION\n  STEP      INC     ATT  ITRS     TOT TIME\n" + "".join(increments))
+    assert early_end(tmp_path / f"Load1{ending}") == ("ended at time 0.4 of 1 (Load1.inp)", True)
+    status.write_text(status.read_text().replace("0.400000E+00", "0.100000E+01"))
+    assert early_end(tmp_path / f"Load1{ending}") is None
+    status.write_text(" THE ANALYSIS HAS NOT BEEN COMPLETED\n")
+    assert early_end(tmp_path / f"Load1{ending}") == ("was not completed (Load1.sta)", True)
+    (tmp_path / "Load1.frd").write_text("damaged")
+    assert early_end(tmp_path / f"Load1{ending}") is None  # another file is what is compared
+
+
 def test_a_run_that_failed_before_its_first_state_has_no_time(folder: Path, tmp_path: Path) -> None:
     whole = (folder / "febio/tet4.xplt").read_bytes()
     at = 4

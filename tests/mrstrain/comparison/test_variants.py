@@ -50,6 +50,20 @@ def test_a_variant_without_a_load_is_told_and_left_out(study: Path) -> None:
     assert not any(f"no result for {load}" in note for load in others for note in done.comparison.notes)
 
 
+def test_a_variant_whose_run_ended_early_is_told_and_left_out(study: Path) -> None:
+    place = variant(study, "stronger", 'model = "right"\ninput = "force"\nsteps = 1.0\n')
+    first, *others = LOADS
+    (place / f"{first}.log").write_text("E R R O R   T E R M I N A T I O N")
+    files, _ = model_files(list(LOADS), [study / "right"], ModelReading())
+    found, notes = with_variants(files, variant_folders([place]), ModelReading())
+    assert [len(found[load][0].variants) for load in LOADS] == [0, *(1 for _ in others)]
+    assert notes[0].endswith(
+        f"{first}.vtu: the run ended with ERROR TERMINATION ({first}.log); this solution is not used."
+    )
+    asked, notes = with_variants(files, variant_folders([place]), ModelReading(unfinished=True))
+    assert (len(asked[first][0].variants), notes) == (1, [])
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
