@@ -1,7 +1,7 @@
 """`check`: checks every input of a study, reports all problems at once, and estimates the cost of the run."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -18,7 +18,7 @@ from dvc.labelling.tissues import NAMES
 from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
-from fe import BONE, MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
+from fe import BONE, Material, MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.acquisition import AcquisitionOptions
@@ -33,6 +33,7 @@ from validate import check_bones, check_overlap, read_thresholds
 
 _T = TypeVar("_T")
 _THERE = 0.5  # smallest fraction of the labelled tissue that must lie in the image
+_MOST_N = 3000.0  # of a load
 _P = ParamSpec("_P")
 
 
@@ -290,6 +291,12 @@ class _Look:
         pressed = [steps[name] for name in plates]
         for step in pressed:
             self.tried(check_loads, plates[step.name], [step])
+            if step.normal_n is not None and step.normal_n > _MOST_N:
+                at = study.at(f"loads.{step.name}", "normal_n")
+                self.notes.append(
+                    f"WARNING: {at}: a force of {step.normal_n:g} N is several times the weight of a person; check its "
+                    "unit."
+                )
         if study.mesh.file is None:
             self.at_tissues(reference, labels, chosen)
             return
@@ -300,9 +307,18 @@ class _Look:
             self.tried(check_overlap, mesh_place(study), mesh, reference.grid)
         held = fixed_facets(mesh, study.models.fixed)
         for one in chosen:
-            laws = self.tried(one.for_regions, mesh.regions)
+            laws = self.laws_of(one, mesh.regions)
             if laws is not None and pressed:
-                self.tried(problems_of, mesh, laws[0], plates, pressed, held, study.models.element)
+                self.tried(problems_of, mesh, laws, plates, pressed, held, study.models.element)
+
+    def laws_of(self, one: MaterialSet, regions: Iterable[str]) -> Mapping[str, Material] | None:
+        """The materials of a set by region, with warnings about odd ones."""
+        found = self.tried(one.for_regions, regions)
+        if found is None:
+            return None
+        laws, told = found
+        self.notes += [note if note.endswith(" is used.") else f"WARNING: {note}" for note in told]
+        return laws
 
     def at_tissues(self, reference: Image | None, labels: LabelMap | None, sets: Sequence[MaterialSet]) -> None:
         """Check that each set has a material for every meshed tissue, and that the tissues lie in the images."""
@@ -323,7 +339,7 @@ class _Look:
                 )
         soft = [name for name in NAMES.values() if not is_bones_name(name)] if labels is None else self.soft(labels)
         for one in sets:
-            self.tried(one.for_regions, soft)
+            self.laws_of(one, soft)
         for region in self.study.uncertainty.stiffness:
             if region not in soft:
                 at = self.study.at("uncertainty", "stiffness")

@@ -80,6 +80,20 @@ def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study
     assert wrong(study, ('"mine.toml", ', "")) == ""
 
 
+def test_odd_materials_and_forces_are_told_before_a_run(study):
+    (study / "stiff.toml").write_text('[stiff]\ntitle = "kPa typed as MPa"\n[stiff.fat]\nlaw = "neo-Hooke"\n'
+                                      "mu_mpa = 10.0\nnu = 0.49\n")  # fmt: skip
+    text = (study / "study.toml").read_text()
+    changed = text.replace('"mine.toml"', '"stiff.toml"').replace("normal_n = 15.0", "normal_n = 1e9", 1)
+    assert changed != text
+    (study / "study.toml").write_text(changed)
+    warnings = [note for note in check(study).notes if note.startswith("WARNING: ")]
+    assert any("stiff: " in note and "fat" in note and "kPa" in note for note in warnings), warnings
+    assert any("a force of 1e+09 N is several times the weight of a person" in note for note in warnings), warnings
+    (study / "study.toml").write_text(text)
+    assert not any("several times" in note for note in check(study).notes)
+
+
 def test_the_command_ends_with_status_2_where_something_is_wrong_and_0_where_nothing_is(study):
     text = (study / "study.toml").read_text().replace('"mine.toml", ', "")
     (study / "study.toml").write_text(text)
