@@ -13,12 +13,14 @@ from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
+from dvc.mesh import repeated_rows
 from dvc.own_files import read_json
 
 BONE, SKIN, CUT = "bone", "skin", "cut"
 """Surface sets: the interface with bone, which is fixed; the outer surface, which the plate may touch; and the
 truncation surface, where the label map ends."""
 
+_SAME_PLACE_MM = 1e-6
 _FIRST_FACET = 101  # first number of the surface sets in the array "region"; those of tissues begin at 1
 _MATERIAL = re.compile(r"material \d+")  # ANSYS also groups cells by material, in addition to components
 
@@ -111,3 +113,14 @@ def fixed_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:
     """Names of the fixed surface sets, as spelt in the mesh: "bone", and those in ``beside``."""
     spelt = {name.casefold(): name for name in mesh.facets} | {name: name for name in mesh.facets}
     return tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in beside)]))
+
+
+def where_open(mesh: TetMesh) -> str:
+    """A sentence if nodes of cells coincide, so that the tissue is open there; empty if none do."""
+    nodes = np.unique(mesh.cells)
+    twice = len(repeated_rows(np.round(mesh.points_mm[nodes] / _SAME_PLACE_MM)))
+    told = (
+        f"{twice} nodes of the mesh lie where another node lies: there, cells overlap or are not connected. Merge "
+        "coincident nodes in the program that made the mesh."
+    )
+    return told if twice else ""

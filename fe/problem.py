@@ -18,7 +18,7 @@ from dvc.file_names import clash, refuse_as_file_name
 from dvc.mesh import repeated_rows
 from fe.elements import element as formulation
 from fe.materials import Materials
-from fe.mesh_file import BONE, SKIN
+from fe.mesh_file import BONE, SKIN, where_open
 from fe.plate import Contact, Plate
 
 _MOST_STIFFNESSES = 1000.0  # largest pressure, in shear moduli: free neo-Hookean tissue keeps 3 % of its thickness
@@ -199,8 +199,12 @@ class Problem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on loads that are unusual for tissue; InputError for those that no tissue can bear."""
-        return tuple(note for load in self.loads if (note := _unusual(self.mesh, self.materials, self.plate, load)))
+        """Sentences on an open mesh and on loads that are unusual for tissue.
+
+        InputError for loads that no tissue can bear.
+        """
+        of_loads = (_unusual(self.mesh, self.materials, self.plate, load) for load in self.loads)
+        return tuple(note for note in (where_open(self.mesh), *of_loads) if note)
 
 
 @checked

@@ -19,6 +19,7 @@ from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
 from fe import BONE, Material, MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
+from fe.problem import Problem
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.acquisition import AcquisitionOptions
@@ -34,6 +35,12 @@ from validate import check_bones, check_overlap, read_thresholds
 _T = TypeVar("_T")
 _THERE = 0.5  # smallest fraction of the labelled tissue that must lie in the image
 _MOST_N = 3000.0  # of a load
+
+
+def _notes(problem: Problem) -> tuple[str, ...]:
+    return problem.notes
+
+
 _P = ParamSpec("_P")
 
 
@@ -309,7 +316,9 @@ class _Look:
         for one in chosen:
             laws = self.laws_of(one, mesh.regions)
             if laws is not None and pressed:
-                self.tried(problems_of, mesh, laws, plates, pressed, held, study.models.element)
+                problems = self.tried(problems_of, mesh, laws, plates, pressed, held, study.models.element) or []
+                odd = [note for each in problems for note in self.tried(_notes, each) or ()]
+                self.notes += [f"WARNING: {note}" for note in dict.fromkeys(odd)]
 
     def laws_of(self, one: MaterialSet, regions: Iterable[str]) -> Mapping[str, Material] | None:
         """The materials of a set by region, with warnings about odd ones."""

@@ -12,6 +12,7 @@ from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe import LoadState, LoadStep, NeoHooke, Ogden, Plate, Problem, Tolerance, cauchy_stress, region_figures
+from fe.mesh_file import where_open
 from tests.blocks import block
 from tests.fe.solving import Notebook, solved
 from tests.fe.test_assembly import needs_ngsolve
@@ -313,6 +314,18 @@ def test_cells_that_are_there_twice_are_refused() -> None:
     twice = TetMesh(mesh.points_mm, np.concatenate([mesh.cells, again]), dict(mesh.regions) | {"fat": fat}, mesh.facets)
     with pytest.raises(InputError, match=r"5 of 53 cells are repeated.* They are cells 48, 49, 50 \.\.\. \(from 0\)"):
         press(twice, PRESS)
+
+
+def test_cells_that_overlap_or_are_not_connected_are_told() -> None:
+    mesh = dome((2, 2, 2))
+    assert Problem(mesh, LAWS, Plate(DOWN, ALONG), [LoadStep("a", normal_n=1.0)]).notes == ()
+    points, cells = np.concatenate([mesh.points_mm, mesh.points_mm[mesh.cells[7, :2]]]), mesh.cells.copy()
+    cells[7, :2] = len(mesh.points_mm) + np.arange(2)
+    apart = TetMesh(points, cells, dict(mesh.regions), mesh.facets)
+    assert where_open(apart).startswith("2 nodes of the mesh lie where another node lies")
+    unused = TetMesh(points, mesh.cells, dict(mesh.regions), mesh.facets)
+    assert where_open(unused) == ""
+    assert where_open(apart) in Problem(apart, LAWS, Plate(DOWN, ALONG), [LoadStep("a", normal_n=1.0)]).notes
 
 
 def test_the_plate_travels_its_gap_first(sheared: list[LoadState]) -> None:
