@@ -4,6 +4,7 @@ import logging
 import os
 import re
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -65,6 +66,7 @@ class _Children(LokyContext):  # type: ignore[misc]
 
 
 _here: list[None] = []  # blocks of `in_this_process`
+_parents: list[int] = []  # of this process, if it is a child of a `Worker`
 
 
 @contextmanager
@@ -310,6 +312,27 @@ def _then_hand_back(task: Callable[..., _T], *args: Any) -> _T:
         hand_memory_back()
 
 
+@contextmanager
+def ended_with_parent() -> Iterator[None]:
+    """End this process with its parent even while native code holds the interpreter, where it is a child.
+
+    A thread of Python, which looks for the parent otherwise, does not run then.
+    """
+    if not _parents or not hasattr(os, "fork"):
+        yield
+        return
+    me = os.getpid()
+    look = f"while kill -0 {_parents[-1]} && kill -0 {me}; do sleep 1; done; kill -9 {me}"
+    nowhere = subprocess.DEVNULL
+    with subprocess.Popen(
+        ["/bin/sh", "-c", look], process_group=0, stdin=nowhere, stdout=nowhere, stderr=nowhere
+    ) as watcher:
+        try:
+            yield
+        finally:
+            watcher.kill()
+
+
 def _imported(module: str) -> None:
     import_module(module)
     if (compiled := sys.modules.get("dvc.compiled")) is not None:
@@ -319,6 +342,7 @@ def _imported(module: str) -> None:
 def _end_with(parent: int) -> None:
     """Let the child end when its parent is gone, and leave interrupts from the keyboard to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _parents.append(parent)
 
     def watch() -> None:
         while os.getppid() == parent:

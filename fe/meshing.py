@@ -13,7 +13,7 @@ from dvc.arguments import checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.mesh import faces_of, signed_volumes
-from dvc.worker import Worker
+from dvc.worker import Worker, ended_with_parent
 from fe.mesh_file import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.tissue_surfaces import borders_of, labels_at, thinned, with_volumes
@@ -214,10 +214,11 @@ def _tetrahedra(
     size = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
     names = ("bg_vertices", "bg_tets", "bg_values")
     finer = {} if lattice is None else dict(zip(names, lattice, strict=True))
-    points, cells = pytetwild.tetrahedralize(
-        points_mm, triangles.astype(np.int32), edge_length_abs=_LONGER * edge_mm, epsilon=envelope_mm / size,
-        disable_filtering=True, num_threads=1, vtk_ordering=True, quiet=True, **finer,
-    )  # fmt: skip
+    with ended_with_parent():
+        points, cells = pytetwild.tetrahedralize(
+            points_mm, triangles.astype(np.int32), edge_length_abs=_LONGER * edge_mm, epsilon=envelope_mm / size,
+            disable_filtering=True, num_threads=1, vtk_ordering=True, quiet=True, **finer,
+        )  # fmt: skip
     return np.asarray(points), np.asarray(cells, dtype=np.int64)
 
 

@@ -99,6 +99,8 @@ def main() -> None:
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    if (closed := getattr(signal, "SIGHUP", None)) and signal.getsignal(closed) == signal.SIG_DFL:  # not under nohup
+        signal.signal(closed, lambda *_: sys.exit(128 + signal.SIGTERM))
     signal.signal(signal.SIGINT, _interrupted)
     atexit.register(gc.freeze)  # half a second of collecting what ends with the process anyway
     try:
