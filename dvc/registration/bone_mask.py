@@ -1,4 +1,4 @@
-"""Whether a bone mask lies on the bone: its edge must follow an edge of the image, and better than its mirror images.
+"""Whether a bone mask lies on the bone: its surface must follow an edge of the image, better than its mirror images.
 
 A mask that was written in another frame (RAS read as LPS) or with a flipped axis may still cover half of the bone. The
 alignment then follows soft tissue, and a strain that looks sound is measured relative to it.
@@ -20,20 +20,24 @@ _ENDS = 2  # voxels along the image's ends are left out: no gradient is known th
 _EDGE = 0.75  # of the largest voxel edge: voxels nearer than that to the surface are its edge
 _NEAR_MM = 2.5, 6.0  # distances of the voxels that it is compared with
 _BETTER = 1.2  # on heels, mirror images have at most 0.87 times the sharpness of a right mask
+_FOLLOWS = 1.1  # right masks of heels have 2 and more, those a voxel off 1.2 and more (benchmarks.bone_masks)
+_LIES = 1.3  # of a mirrored mask that is right: one a voxel off has 1.2 and more, and in other places up to 1.2
+_FROM_AIR_MM = 3.0
 _MORE = 1.02  # times the sharpest of those about the image's middle, one of which it is where the origin lies there
 _LEAST, _MOSTLY = 500, 0.5  # voxels of the mask, and the fraction of them that lies on the image in the other frame
 _TO_THE_OTHER = np.array([-1.0, -1.0, 1.0])
 _AXES = ("first", "second", "third")
 
 
-def mirrored_doubt(image: Image, bone: Mask) -> str:
-    """Why the mask may be mirrored, in a sentence; empty where it lies better on the image than its mirror images.
+def mask_doubt(image: Image, bone: Mask, body: Mask) -> str:
+    """Why the mask may not lie on the bone, in a sentence; empty where its surface follows an edge of the image.
 
-    The mask is on the image's grid. Its sharpness is the median of the image's gradient at the mask's surface, over
-    that 2.5 to 6 mm inside and outside of it. Mirror images are those along the voxel axes, about the image's middle,
-    and that with the signs of L and P reversed, as of a mask in RAS that was read as LPS.
+    The masks are on the image's grid; the surface of the body is no edge of bone. The sharpness of a mask is the median
+    of the image's gradient at its surface, over that 2.5 to 6 mm inside and outside of it. Mirror images are those
+    along the voxel axes, about the image's middle, and that with the signs of L and P reversed, as of a mask in RAS
+    that was read as LPS.
     """
-    gradient = _gradient(image)
+    gradient, follows = _gradient(image), edge_sharpness(image, bone, body)
     i, j, k = (slice(_ENDS, n - _ENDS) for n in image.grid.shape)
     gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
     if not bone.inside.any() or bone.inside.all():
@@ -48,13 +52,30 @@ def mirrored_doubt(image: Image, bone: Mask) -> str:
         if sharpness > _MORE * max(of_flips):
             found["with the signs of L and P reversed"] = sharpness
     best = max(found, key=lambda how: found[how])
-    if not found[best] > _BETTER * own:
-        return ""
+    if not found[best] > max(_BETTER * own, _LIES):
+        return _edgeless(follows) if follows < _FOLLOWS else ""
     return (
         f"The bone mask may be mirrored or in another frame (RAS for LPS): {best}, its surface would follow the edges "
         f"of the unloaded image better (sharpness {found[best]:.2f} instead of {own:.2f}). Check it on the unloaded "
         "image."
     )
+
+
+def _edgeless(sharpness: float) -> str:
+    return (
+        "The surface of the bone mask follows no edge inside the unloaded image, as that of a bone does (sharpness "
+        f"{sharpness:.2f}; use with care below {_FOLLOWS:g}). The mask may be shifted, too large, or not that of a "
+        "bone. Check it on the unloaded image."
+    )
+
+
+def edge_sharpness(image: Image, bone: Mask, body: Mask) -> float:
+    """Median gradient of an image at the surface of a bone mask, over that 2.5 to 6 mm from it; 0 without a surface.
+
+    The masks are on its grid. Only the surface more than 3 mm inside the body counts.
+    """
+    deep = distance_transform_edt(body.inside | bone.inside, image.grid.spacing_mm) > _FROM_AIR_MM
+    return _sharpness(bone, [_gradient(image)], deep)[0]
 
 
 def _named(flip: tuple[slice, ...]) -> str:
@@ -85,13 +106,15 @@ def _gradient(image: Image) -> Float32Array:
     return np.sqrt(squared)
 
 
-def _sharpness(bone: Mask, gradients: Sequence[Float32Array]) -> list[float]:
-    """Sharpness of a mask on images of such gradients, on its grid."""
+def _sharpness(bone: Mask, gradients: Sequence[Float32Array], where: BoolArray | None = None) -> list[float]:
+    """Sharpness of a mask on images of such gradients, on its grid; ``where`` voxels count."""
     edges = bone.grid.spacing_mm
     box = bone.box(int(np.ceil(_NEAR_MM[1] / edges.min())) + 1)
     inside = bone.inside[box]
     depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
     at, near = depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
+    if where is not None:
+        at, near = at & where[box], near & where[box]
     return [_contrast(gradient[box], at, near) for gradient in gradients]
 
 

@@ -28,7 +28,7 @@ from dvc.images.noise import Noise, noise_of
 from dvc.images.tissue import bright_voxels, tissue_mask
 from dvc.memory import hand_memory_back
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
-from dvc.registration.bone_mask import mirrored_doubt
+from dvc.registration.bone_mask import mask_doubt
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
 from dvc.registration.engines import DEFAULT, engine_named
 from dvc.worker import Worker
@@ -192,7 +192,7 @@ def register(
         # Only now: it is done while the worker aligns, and has not kept it waiting for its images.
         beside.submit(engine.prepare)
         noise = beside.submit(noise_of, reference, loaded, body)
-        doubt = beside.submit(mirrored_doubt, reference, bone) if bone and chosen.align_on == "bone" else None
+        doubt = beside.submit(mask_doubt, reference, bone, body) if bone and chosen.align_on == "bone" else None
         alignment = _alignment(fixed, moving, within, rigid, chosen, runner)
         pair = AlignedPair.of(fixed, moving, alignment.motion, within, rigid, tissues)
         tell("aligning", 1.0)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.bone_masks import masks
 from dvc import fit_mask
 from dvc.images.image import Image, Mask
+from dvc.images.tissue import tissue_mask
 from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
 from dvc.measurement.subject import Subject
-from dvc.registration.bone_mask import mirrored_doubt
+from dvc.registration.bone_mask import mask_doubt
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Settings, register
 from phantoms import Heel, heel_grid, heel_pair, labels_of, scan
@@ -27,14 +29,14 @@ def flipped(mask: Mask, *axes: int) -> Mask:
 @pytest.mark.parametrize("pair", ["small_pair", "tiny_pair"])
 def test_a_right_mask_raises_no_doubt(pair, request):
     heel = request.getfixturevalue(pair)
-    assert mirrored_doubt(heel.reference, heel.bone) == ""
+    assert mask_doubt(heel.reference, heel.bone, tissue_mask(heel.reference)) == ""
 
 
 @pytest.mark.parametrize("pair", ["small_pair", "tiny_pair"])
 @pytest.mark.parametrize(("axes", "told"), [((1,), "second"), ((2,), "third"), ((0, 1), "first and second")])
 def test_a_mirrored_mask_is_told_with_its_axes(pair, axes, told, request):
     heel = request.getfixturevalue(pair)
-    doubt = mirrored_doubt(heel.reference, flipped(heel.bone, *axes))
+    doubt = mask_doubt(heel.reference, flipped(heel.bone, *axes), tissue_mask(heel.reference))
     assert f"mirrored along the {told} voxel axis" in doubt
 
 
@@ -67,7 +69,7 @@ def test_a_mask_is_judged_alike_at_any_voxels(heel_at, axes, moved_mm, told):
     image, bone = heel_at
     steps = np.round(np.array(moved_mm) / bone.grid.spacing_mm).astype(int)
     mask = Mask(bone.grid, np.roll(flipped(bone, *axes).inside, steps, (0, 1, 2)))
-    doubt = mirrored_doubt(image, mask)
+    doubt = mask_doubt(image, mask, tissue_mask(image))
     assert (f"mirrored along the {told} voxel axis" in doubt) if told else (doubt == "")
 
 
@@ -86,18 +88,29 @@ def test_a_mask_in_the_other_frame_is_told_wherever_the_image_lies(shift_mm, tur
     own = grid.part(box)
     own = replace(own, origin_mm=signs @ own.origin_mm, direction=signs @ own.direction)
     wrong = fit_mask(Mask(own, right.inside[box]), grid, "bone mask")
-    assert "with the signs of L and P reversed, its surface" in mirrored_doubt(image, wrong)
-    assert mirrored_doubt(image, right) == ""
+    assert "with the signs of L and P reversed, its surface" in mask_doubt(image, wrong, tissue_mask(image))
+    assert mask_doubt(image, right, tissue_mask(image)) == ""
 
 
-def test_noise_and_a_mask_at_the_ends_of_the_image_raise_no_doubt(tiny_pair):
+@pytest.mark.parametrize("wrong", ["10 mm beside", "15 mm beside", "3 mm too large", "upper half of the body"])
+def test_a_mask_that_follows_no_edge_is_told_and_one_that_is_a_voxel_off_is_not(heel_at, wrong):
+    image, bone = heel_at
+    body = tissue_mask(image)
+    given = masks(bone, body, seed=1)
+    for name in ("right", "a voxel too large", "a voxel too small"):
+        assert mask_doubt(image, given[name], body) == "", name
+    assert "follows no edge inside the unloaded image" in mask_doubt(image, given[wrong], body)
+
+
+def test_noise_has_no_edge_and_a_mask_at_the_ends_of_the_image_raises_no_error(tiny_pair):
     grid = tiny_pair.reference.grid
     noise = Image(grid, np.random.default_rng(1).normal(100.0, 10.0, grid.shape).astype(np.float32))
-    assert mirrored_doubt(noise, tiny_pair.bone) == ""
+    body = Mask(grid, np.ones(grid.shape, dtype=bool))
+    assert "follows no edge" in mask_doubt(noise, tiny_pair.bone, body)
     for part in (np.s_[:5], np.s_[:, -3:], np.s_[:]):
         inside = np.zeros(grid.shape, dtype=bool)
         inside[part] = True
-        assert mirrored_doubt(noise, Mask(grid, inside)) == ""
+        assert "mirrored" not in mask_doubt(noise, Mask(grid, inside), body)
 
 
 @pytest.mark.usefixtures("in_this_process")
