@@ -1,11 +1,13 @@
 """How long a run still takes: what its stages are expected to take, corrected by how long the others took."""
 
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-_TRUST_S = 20.0  # of the expectation: it counts as if so many seconds of stages had ended just as expected
+_TRUST_S = 15.0  # the expectation counts as if so many seconds of stages had ended just as expected
+_ALIKE_S = 80.0  # the pace of all kinds counts as if so many seconds of stages of one kind had ended at that pace
 _OVERDUE = 0.25  # of the time that a stage has taken already, where it should have ended
 
 
@@ -16,6 +18,7 @@ class Expected:
     seconds: float
     cores: int = 1
     before: tuple[str, ...] = ()
+    kind: str = ""  # stages of one kind are as much faster or slower than expected as one another
 
     def after(self, prefix: str) -> Self:
         """The same, waiting for stages whose names begin with a prefix."""
@@ -39,11 +42,31 @@ def seconds_to_end(stages: Mapping[str, Expected], left: Mapping[str, float] | N
 
 
 @dataclass(slots=True)
-class TimeLeft:
-    """Time until the last of some stages ends, on so many workers.
+class Pace:
+    """Time that stages take over what they were expected to, for each kind of stage.
 
-    All stages are expected to be as much faster or slower than expected as those that have ended were.
+    With t and e the sums of the time taken and expected: of all kinds together p = (T + t) / (T + e), T = 15 s, near 1
+    while little has ended; of one kind (A p + t_kind) / (A + e_kind), A = 80 s, near p while little of it has ended. A
+    slow machine slows down every kind, but fast registrations hardly promise fast simulations.
     """
+
+    taken: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    expected: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    def add(self, stage: Expected, taken: float) -> None:
+        """Count a stage, and the seconds that it took."""
+        self.taken[stage.kind] += taken
+        self.expected[stage.kind] += stage.seconds
+
+    def of(self, stage: Expected) -> float:
+        """The pace of the kind of a stage."""
+        of_all = (_TRUST_S + sum(self.taken.values())) / (_TRUST_S + sum(self.expected.values()))
+        return (_ALIKE_S * of_all + self.taken.get(stage.kind, 0.0)) / (_ALIKE_S + self.expected.get(stage.kind, 0.0))
+
+
+@dataclass(slots=True)
+class TimeLeft:
+    """Time until the last of some stages ends, on so many workers, at the pace of those that have ended (`Pace`)."""
 
     stages: Mapping[str, Expected]  # in an order in which each stands after those that it waits for
     workers: int
@@ -70,7 +93,7 @@ class TimeLeft:
         spent = {name: now - self.began[name] for name in self.under_way}
         pace = self._pace(spent)
         left = {
-            name: max(pace * one.seconds - spent.get(name, 0.0), _OVERDUE * spent.get(name, 0.0))
+            name: max(pace.of(one) * one.seconds - spent.get(name, 0.0), _OVERDUE * spent.get(name, 0.0))
             for name, one in self.stages.items()
             if name not in self.took
         }
@@ -78,13 +101,13 @@ class TimeLeft:
         work = sum(seconds * min(self.stages[name].cores, workers) for name, seconds in left.items())
         return max([work / workers, *seconds_to_end(self.stages, left).values()])
 
-    def _pace(self, spent: Mapping[str, float]) -> float:
-        """Time that stages take over what they were expected to; one under way counts once it takes longer."""
-        ended = {name: taken for name, taken in self.took.items() if taken > 0.0}
-        taken = _TRUST_S + sum(ended.values())
-        expected = _TRUST_S + sum(self.stages[name].seconds for name in ended)
+    def _pace(self, spent: Mapping[str, float]) -> Pace:
+        """The pace of the stages that have ended; one under way counts as soon as it takes longer, as overdue."""
+        pace = Pace()
+        for name, taken in self.took.items():
+            if taken > 0.0:  # others never began
+                pace.add(self.stages[name], taken)
         for name, so_far in spent.items():
-            if so_far * expected > self.stages[name].seconds * taken:
-                taken += so_far
-                expected += self.stages[name].seconds
-        return taken / expected
+            if so_far > pace.of(self.stages[name]) * self.stages[name].seconds:
+                pace.add(self.stages[name], (1.0 + _OVERDUE) * so_far)
+        return pace

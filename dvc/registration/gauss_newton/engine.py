@@ -132,8 +132,8 @@ class GaussNewtonWithInterfaces(Engine):
 
     family, name, note = GaussNewton.family, "gauss-newton-borders", _NOTE
     needs_labels = True
-    # Over twice as long as without (benchmarks/README.md); transform.h5 then holds displacements.
-    cost = Cost(4.0, 11.0, phantom_seconds=52.0, gib_per_mvoxel=0.275, bytes_per_voxel=24.0)
+    # 1.7 times as long as without (benchmarks/README.md); transform.h5 then holds displacements.
+    cost = Cost(4.0, 4.4, phantom_seconds=52.0, gib_per_mvoxel=0.275, bytes_per_voxel=24.0)
 
     def __post_init__(self) -> None:
         if self.skin is not None and not (np.isfinite(self.skin) and self.skin > 0):
