@@ -75,7 +75,7 @@ def test_every_result_is_there_and_the_report_tells_it(done):
     assert "Heel &lt;b&gt;3&lt;/b&gt;" in page
     assert "<b>3</b>" not in page
     assert "Registration of Load1" in page
-    assert "Area between the strain-volume curves" in page
+    assert "Area between measured and simulated strain-volume curves" in page
     assert "Stages" in page
     assert re.search(r"^Report: .*study/results/report\.html$", stdout, re.M)
     assert "akrami" in stdout

@@ -122,7 +122,7 @@ def test_a_study_draws_its_inputs_and_says_what_each_adds(varied: Path) -> None:
     again = run(varied, workers=1)
     assert all(outcome.reused for outcome in again.outcomes.values())
     report = (varied / "results" / "report.html").read_text()
-    assert "were skipped (quick)" not in report
+    assert "was skipped (quick)" not in report
     hurried = run(varied, workers=1, quick=True)
     assert hurried.complete
-    assert "were skipped (quick)" in (varied / "results" / "report.html").read_text()
+    assert "was skipped (quick)" in (varied / "results" / "report.html").read_text()
