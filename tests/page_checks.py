@@ -47,10 +47,11 @@ UNNAMED = """[
   ...[...document.querySelectorAll("th")].filter((one) => !one.scope),
 ].map((one) => one.outerHTML.slice(0, 80))"""
 CUT_OFF = """[...document.querySelectorAll("figure img")].filter((one) => one.checkVisibility()).map((one) => {
-  const seen = one.closest("figure").getBoundingClientRect(), whole = one.getBoundingClientRect();
+  const box = one.closest(".stack"), scrolls = box && getComputedStyle(box).overflowX === "auto";
+  const seen = one.closest("figure").getBoundingClientRect(), whole = (scrolls ? box : one).getBoundingClientRect();
   return Math.max(seen.left - whole.left, whole.right - seen.right, whole.right - innerWidth);
 }).filter((pixels) => pixels > 0.5)"""
-"""Pixels by which pictures are wider than their figure, or than the window."""
+"""Pixels by which pictures, or the boxes in which they scroll, are wider than their figure, or than the window."""
 BROKEN = """[...document.querySelectorAll("td, th")].flatMap((cell) => {
   const text = cell.textContent, from = text.indexOf("("), range = document.createRange();
   if (!cell.checkVisibility() || from < 0 && (text.length > 18 || cell.closest("thead"))) return [];

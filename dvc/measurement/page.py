@@ -61,6 +61,7 @@ def drawings_of(
     through = "Slices through the middle of the tissue."
     if bone is not None:
         through = "Slices through the point of the bone that is nearest to the plate."
+    through += f" The colour scale ends at {SHEAR_SCALE:g}, whatever the load."
     shear = Drawing.of(STRAIN, figures.strain_slices, *strain, note=through)
     if images is not None:
         both = {"unloaded": reference, f"{loaded}, registered": Image(reference.grid, images.registered)}

@@ -21,9 +21,20 @@ document.querySelectorAll(".faders").forEach((faders) => {
     over[number].style.opacity = fader.value / 100;
   }));
 });
-/* On a narrow screen a picture fits it, or is large in a box of its own that scrolls. */
-document.querySelectorAll(".enlarge").forEach((button) => button.addEventListener("click", () => {
-  const picture = button.parentElement.querySelector(".stack"), large = picture.classList.toggle("large");
-  picture.tabIndex = large ? 0 : -1;
-  button.textContent = large ? "Show the whole picture" : "Enlarge the picture";
-}));
+/* On a narrow screen a picture is large in a box of its own that scrolls, by keys too, or fits the screen. */
+const narrow = matchMedia("(max-width: 40rem)");
+const reachable = (box) => {
+  const title = box.closest("figure").querySelector("h3").textContent;
+  const told = { tabindex: "0", role: "group", "aria-label": `${title} (scrolls sideways)` };
+  const scrolls = narrow.matches && !box.classList.contains("fitted");
+  Object.entries(told).forEach(([name, value]) => (scrolls ? box.setAttribute(name, value) : box.removeAttribute(name)));
+};
+document.querySelectorAll(".stack").forEach((box) => {
+  const button = box.closest("figure").querySelector(".fit");
+  button.addEventListener("click", () => {
+    button.textContent = box.classList.toggle("fitted") ? "Enlarge the picture" : "Show the whole picture";
+    reachable(box);
+  });
+  narrow.addEventListener("change", () => reachable(box));
+  reachable(box);
+});

@@ -12,10 +12,16 @@ import pytest
 
 from dvc.images.image import Grid
 from dvc.report.page import Picture, Section, Table, Viewer, Volume, write_report
+from dvc.report.style import SMALL_PT
 from dvc.trust.verdict import Verdict
 from tests.browser import CHROMIUM, Tab, browser
 from tests.dvc.report.test_page import png
 from tests.page_checks import BROKEN, CUT_OFF, HEADINGS, NO_WEBGL, PALE, TOO_WIDE, UNFOLD, UNNAMED, WIDTHS, opened
+
+BUTTON, BOX = "document.querySelector('.fit')", "document.querySelector('.stack')"
+HINT = "document.querySelector('.sideways').checkVisibility()"
+SMALLEST_LETTER_PX = f"""Math.min(...[...document.querySelectorAll(".stack img")].filter((one) => one.checkVisibility())
+  .map((one) => {SMALL_PT} / 72 * 96 * one.getBoundingClientRect().width / one.getAttribute("width")))"""
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")
 
@@ -78,20 +84,43 @@ def test_what_does_not_fit_or_is_pale_is_found(tab: Tab, page: Path) -> None:
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_a_picture_is_seen_whole_and_can_be_enlarged_on_a_telephone(tab: Tab, page: Path, width: int) -> None:
+def test_letters_in_a_picture_are_legible_on_a_telephone_and_it_can_be_seen_whole(
+    tab: Tab, page: Path, width: int
+) -> None:
     opened(tab, page, width)
-    button, box = ("document.querySelector('.enlarge')", "document.querySelector('.stack')")
-    assert tab.value(f"{button}.checkVisibility()") == (width == 400)
-    tab.value(f"{button}.click()")
+    assert tab.value(f"{BUTTON}.checkVisibility()") == (width == 400)
+    assert tab.value(HINT) == (width == 400)
+    assert tab.value(SMALLEST_LETTER_PX) >= 9.0
     if width == 400:  # it scrolls in its own box, by touch and by keys; the page does not
-        assert tab.value(f"{box}.scrollWidth > 1.5 * {box}.clientWidth")
-        assert tab.value(f"{box}.tabIndex") == 0
+        assert tab.value(f"{BOX}.scrollWidth > 1.5 * {BOX}.clientWidth")
+        assert tab.value(f"{BOX}.getAttribute('aria-label')") == "Strain (scrolls sideways)"
+        tab.value(f"{BOX}.focus()")
+        for kind in ("rawKeyDown", "keyUp"):
+            tab.call("Input.dispatchKeyEvent", type=kind, key="ArrowRight", code="ArrowRight", windowsVirtualKeyCode=39)
+        tab.wait_for(f"{BOX}.scrollLeft > 0")
+    assert tab.value(f"{BOX}.tabIndex") == (0 if width == 400 else -1)  # no stop of the keys where nothing scrolls
     assert tab.value(TOO_WIDE) <= 0
-    assert tab.value(f"{button}.textContent") == "Show the whole picture"
-    tab.value(f"{button}.click()")
-    assert tab.value(f"{button}.textContent") == "Enlarge the picture"
+    assert tab.value(f"{BUTTON}.textContent") == "Show the whole picture"
+    tab.value(f"{BUTTON}.click()")
+    assert tab.value(f"{BUTTON}.textContent") == "Enlarge the picture"
+    assert tab.value(f"{BOX}.scrollWidth <= {BOX}.clientWidth")
+    assert tab.value(f"{BOX}.tabIndex") == -1
+    assert not tab.value(HINT)
     assert tab.value(CUT_OFF) == []
+    tab.value(f"{BUTTON}.click()")
+    assert tab.value(f"{BUTTON}.textContent") == "Show the whole picture"
     assert tab.said == []
+
+
+def test_letters_in_a_picture_are_legible_without_scripts(tab: Tab, page: Path) -> None:
+    tab.call("Emulation.setScriptExecutionDisabled", value=True)
+    opened(tab, page, 400)
+    assert tab.value(SMALLEST_LETTER_PX) >= 9.0
+    assert tab.value(f"{BOX}.scrollWidth > 1.5 * {BOX}.clientWidth")
+    assert tab.value(TOO_WIDE) <= 0
+    assert tab.value(HINT)
+    assert not tab.value(f"{BUTTON}.checkVisibility()")  # it would do nothing
+    tab.call("Emulation.setScriptExecutionDisabled", value=False)
 
 
 def test_a_screen_reader_finds_its_way(tab: Tab, page: Path) -> None:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from dvc.report.drawing import png_bytes
+from dvc.report.page import Picture, Section, write_report
+from dvc.trust.verdict import Verdict
+from fe.figures import Slice, slice_sheet
+from tests.blocks import block
 from tests.browser import CHROMIUM, Tab, browser
 from tests.page_checks import BROKEN, CUT_OFF, HEADINGS, PALE, TOO_WIDE, UNFOLD, UNNAMED, WIDTHS, opened
+from tests.printed import PAPERS, printed, sheets_of
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")
 
@@ -59,11 +66,41 @@ def test_a_screen_reader_finds_its_way_through_the_report_of_a_study(tab, report
 
 def test_the_report_of_a_study_prints_whole_and_no_page_ends_with_a_heading(tab, report):
     opened(tab, report, 1400)
-    printed = base64.b64decode(tab.call("Page.printToPDF", printBackground=False)["data"])
-    assert printed.startswith(b"%PDF")
+    pdf = printed(tab)
+    assert pdf.startswith(b"%PDF")
     assert tab.value("[...document.querySelectorAll('main details')].every((part) => part.open)")
+    figures = sheets_of(pdf, "Figure")
+    assert len(figures) > 20
+    assert [sheets for sheets in figures if len(sheets) != 1] == []
     tab.call("Emulation.setEmulatedMedia", media="print")
     assert tab.value(SPLIT) == []
     tab.value("document.querySelector('main h2').style.breakAfter = 'auto'")
     assert len(tab.value(SPLIT)) == 1
+    tab.call("Emulation.setEmulatedMedia", media="")
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_a_figure_of_seven_panels_prints_on_one_sheet_with_its_heading_and_caption(
+    tab: Tab, tmp_path: Path, paper: str
+) -> None:
+    mesh = block((6, 6, 6), (60.0, 60.0, 60.0))
+    panels = [Slice(f"model {n}", np.zeros_like(mesh.points_mm), np.full(len(mesh.cells), 0.1 * n)) for n in range(7)]
+    png = png_bytes(slice_sheet(mesh, panels, np.eye(3), np.full(3, 30.0)))
+    width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
+    assert height > 2 * width  # scaled to the width of a sheet, it is taller than one
+    caption = "Maximum shear strain in a slice, measured and simulated, on the deformed tissue. " * 6
+    picture, words = Picture("Location of the strain", caption, png), ("The volume that is compared. " * 60,)
+    sections = [Section(f"Load{n}", Verdict("trust"), pictures=(picture,), paragraphs=words[n:]) for n in range(2)]
+    path = tmp_path / "report.html"
+    write_report(path, "A heel", None, sections, [], {})
+    opened(tab, path, 1400)
+    pdf = printed(tab, paper)
+    figures, headings = sheets_of(pdf, "Figure"), sheets_of(pdf, "H3")
+    assert len(figures) == 4  # each with its picture
+    assert [len(sheets) for sheets in figures] == [1] * 4
+    assert all(heading in figures for heading in headings)
+    assert sheets_of(pdf, "H2")[-1] == headings[-1]  # nor does the section's heading stay behind
+    assert tab.said == []
+    tab.call("Emulation.setEmulatedMedia", media="print")
+    assert tab.value("getComputedStyle(document.querySelector('.stack img')).objectFit") == "contain"  # not squeezed
     tab.call("Emulation.setEmulatedMedia", media="")
