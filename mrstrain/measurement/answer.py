@@ -13,6 +13,7 @@ from dvc.report.page import Section, Table
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
+_NEARLY = 0.9
 _INTERVALS = ", with the interval of 95 % coverage in brackets"
 
 
@@ -58,13 +59,15 @@ def measured_strain(
 def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) -> tuple[str, ...]:
     """A sentence on the most strained tissue of a table of `table_of_loads`; none without a table.
 
-    It is the one with the largest 95th percentile, by the lower end of the interval where there is one: a tissue of few
-    voxels may have a larger percentile by chance.
+    It is the one with the largest 95th percentile of those whose interval begins within 10 % of the highest beginning:
+    a tissue of few voxels may have a larger percentile by chance.
     """
-    known = [row for row in table.rows if _at_least(row[3]) is not None] if table is not None else []
+    known = [(_numbers(row[3]), row) for row in table.rows if _numbers(row[3])] if table is not None else []
     if not known:
         return ()
-    load, tissue, median, high, *_ = max(known, key=lambda row: _at_least(row[3]) or 0.0)
+    begins = [numbers[:2][-1] for numbers, _ in known]  # of the interval; or the value, without one
+    likely = [one for one, begin in zip(known, begins, strict=True) if begin >= _NEARLY * max(begins)]
+    _, (load, tissue, median, high, *_) = max(likely, key=lambda one: one[0][0])
     force = f" ({beside.forces[str(load)]})" if str(load) in beside.forces else ""
     told = f"The most strained tissue is {tissue} under {load}{force}: measured maximum shear strain {median} in the "
     told += f"median and {high} at the 95th percentile"
@@ -74,10 +77,9 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     return (told,)
 
 
-def _at_least(cell: object) -> float | None:
-    """Lower end of the interval in a cell of `table_of_loads`, or the value without an interval; None for a dash."""
-    numbers = [float(number) for number in re.findall(r"\d+\.?\d*", str(cell))]
-    return numbers[:2][-1] if numbers else None
+def _numbers(cell: object) -> list[float]:
+    """Numbers of a cell of `table_of_loads`: the value, and the ends of its interval if there is one."""
+    return [float(number) for number in re.findall(r"\d+\.?\d*", str(cell))]
 
 
 def table_of_loads(measured: Sequence[Section]) -> Table | None:

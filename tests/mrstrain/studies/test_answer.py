@@ -87,8 +87,9 @@ def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_
     assert "less than 1 % above 0.2" in first.tables[0].note
 
 
-def test_the_most_strained_tissue_is_that_of_the_largest_lower_end_of_the_95th_percentile() -> None:
+def test_the_most_strained_tissue_is_surely_so() -> None:
     rows = (
+        ("Load1", "muscle", "0.1 (0.0 to 0.2)", "0.41 (0.405 to 0.46)"),
         ("Load1", "fat", "0.3 (0.2 to 0.4)", "0.419 (0.4 to 0.5)"),
         ("Load2", "tendon", "0.3 (0.1 to 0.4)", "0.464 (0.180 to 0.759)"),
         ("Load2", "skin", "–", "–"),
@@ -100,10 +101,10 @@ def test_the_most_strained_tissue_is_that_of_the_largest_lower_end_of_the_95th_p
         "median and 0.419 (0.4 to 0.5) at the 95th percentile, with 95 % intervals in brackets. The noise floor is "
         "0.011 and 0.029.",
     )
-    without = ((*rows[0][:2], "0.3", "0.41"), (*rows[1][:2], "0.3", "0.42"))
+    without = ((*rows[1][:2], "0.3", "0.41"), (*rows[2][:2], "0.3", "0.42"))
     (plain,) = most_strained(Table("Measured", columns, without))
     assert plain.startswith("The most strained tissue is tendon under Load2: ")
-    assert most_strained(Table("Measured", columns, rows[2:])) == most_strained(None) == ()
+    assert most_strained(Table("Measured", columns, rows[3:])) == most_strained(None) == ()
 
 
 def test_the_noise_floor_is_that_of_any_load_and_none_without_a_repeat_scan(tmp_path: Path) -> None:
