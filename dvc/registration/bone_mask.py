@@ -37,7 +37,8 @@ def mask_doubt(image: Image, bone: Mask, body: Mask) -> str:
     along the voxel axes, about the image's middle, and that with the signs of L and P reversed, as of a mask in RAS
     that was read as LPS.
     """
-    gradient, follows = _gradient(image), edge_sharpness(image, bone, body)
+    gradient = _gradient(image)
+    follows = _inner_sharpness(gradient, bone, body)
     i, j, k = (slice(_ENDS, n - _ENDS) for n in image.grid.shape)
     gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
     if not bone.inside.any() or bone.inside.all():
@@ -74,8 +75,17 @@ def edge_sharpness(image: Image, bone: Mask, body: Mask) -> float:
 
     The masks are on its grid. Only the surface more than 3 mm inside the body counts.
     """
-    deep = distance_transform_edt(body.inside | bone.inside, image.grid.spacing_mm) > _FROM_AIR_MM
-    return _sharpness(bone, [_gradient(image)], deep)[0]
+    return _inner_sharpness(_gradient(image), bone, body)
+
+
+def _inner_sharpness(gradient: Float32Array, bone: Mask, body: Mask) -> float:
+    """Sharpness of a mask on an image of such a gradient, away from the surface of the body."""
+    edges = bone.grid.spacing_mm
+    box = bone.box(int(np.ceil((_NEAR_MM[1] + _FROM_AIR_MM) / edges.min())) + 1)
+    if not bone.inside.any():
+        return 0.0
+    deep = distance_transform_edt((body.inside | bone.inside)[box], edges) > _FROM_AIR_MM
+    return _sharpness(Mask(bone.grid.part(box), bone.inside[box]), [gradient[box]], deep)[0]
 
 
 def _named(flip: tuple[slice, ...]) -> str:
