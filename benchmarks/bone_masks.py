@@ -20,7 +20,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, shift
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, shift
 
 from dvc import Image, Mask
 from dvc.images.tissue import tissue_mask
@@ -37,8 +37,7 @@ def masks(bone: Mask, body: Mask, seed: int) -> dict[str, Mask]:
     """Right masks and wrong ones, by what is wrong."""
     grid, edges, inside = bone.grid, bone.grid.spacing_mm, bone.inside
     depth = distance_transform_edt(inside, edges) - distance_transform_edt(~inside, edges)
-    voxel, rng = float(edges.max()), np.random.default_rng(seed)
-    way = rng.normal(size=3)
+    way = np.random.default_rng(seed).normal(size=3)
     way /= np.linalg.norm(way)
     moved = {
         f"{mm} mm beside": shift(inside.astype(np.float32), mm * way / edges, order=1) > 0.5 for mm in (3, 5, 10, 15)
@@ -46,7 +45,7 @@ def masks(bone: Mask, body: Mask, seed: int) -> dict[str, Mask]:
     upper = body.inside & (grid.points() @ [0.0, 0.0, 1.0] > np.median(body.points()[:, 2]))
     ball = np.linalg.norm(grid.points() - body.points().mean(axis=0), axis=-1) < 15.0
     found = {
-        "right": inside, "a voxel too large": depth > -voxel, "a voxel too small": depth > voxel,
+        "right": inside, "a voxel too large": binary_dilation(inside), "a voxel too small": binary_erosion(inside),
         "3 mm too large": depth > -3.0, "3 mm too small": depth > 3.0, **moved, "upper half of the body": upper,
         "ball": ball, "whole body": body.inside,
     }  # fmt: skip

@@ -35,8 +35,9 @@ def refuse_path(path: str | os.PathLike[str]) -> None:
     text = os.fspath(path)
     if "\0" in text:
         raise InputError(f"{text!r} has a null character (\\u0000), which no path has. Type it again.")
-    longest = max((part for part in text.split(os.sep)), key=len)
-    if (size := len(os.fsencode(longest))) > _MOST_OF_A_PATH:
+    sizes = {part: len(part.encode(errors="replace")) for part in text.split(os.sep)}
+    longest = max(sizes, key=lambda part: sizes[part])
+    if (size := sizes[longest]) > _MOST_OF_A_PATH:
         raise InputError(
             f"{longest[:40]}...: a name of {size} bytes; file systems take {_MOST_OF_A_PATH}. Choose a shorter one."
         )

@@ -46,9 +46,9 @@ def parse_toml(text: str) -> dict[str, Any]:
     """
     try:
         told = tomllib.loads(text)
+        _refuse_large(told)
     except RecursionError as endless:
         raise ValueError(_NESTED) from endless
-    _refuse_large(told)
     return told
 
 

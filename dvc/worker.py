@@ -85,8 +85,8 @@ def in_this_process() -> Iterator[None]:
 class Worker(AbstractContextManager["Worker", None]):
     """One child process that runs one task at a time; if it dies, that task fails and the next gets a fresh process.
 
-    So it is after an interrupt, too, which ends the process with its task. A process that dies between tasks is
-    replaced, and no task fails.
+    So it is after an interrupt, too, which ends the process with its task. A process that is seen to have died between
+    tasks is replaced, and no task fails.
 
     Native code (ITK, numba, BLAS) may use ``threads`` threads in it: results of elastix are equal bit for bit only for
     equal numbers. It is kept alive between tasks, because the first use of elastix costs many seconds.
@@ -322,7 +322,7 @@ def ended_with_parent() -> Iterator[None]:
         yield
         return
     me = os.getpid()
-    look = f"while kill -0 {_parents[-1]} && kill -0 {me}; do sleep 1; done; kill -9 {me}"
+    look = f"while kill -0 {_parents[-1]}; do kill -0 {me} || exit; sleep 1; done; kill -9 {me}"
     nowhere = subprocess.DEVNULL
     with subprocess.Popen(
         ["/bin/sh", "-c", look], process_group=0, stdin=nowhere, stdout=nowhere, stderr=nowhere

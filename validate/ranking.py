@@ -75,7 +75,7 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     informative = None if ALL_LOADS in uninformative else band
     pairs = {ALL_LOADS: _pairs(ranked, informative)}
     pairs |= {one.load: _pairs(one.ranked(), None if one.hardly_strained else one.bands.get(ALL)) for one in loads}
-    many = len(loads) > 1 and bool(everywhere) and informative is not None
+    many = len(loads) > 1 and bool(ranked) and informative is not None
     statements = [_under(one, pairs[one.load], many) for one in sorted(loads, key=lambda one: one.hardly_strained)]
     if many:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
@@ -138,7 +138,7 @@ def _statement(
         return ""
     best = ranked[0]
     area = f"{best.best_ml:.2f} mL (95 % interval {best.low_ml:.2f} to {best.high_ml:.2f})"
-    scale = f"a perfect model has 0 mL, one without deformation {nothing.best_ml:.2f} mL."
+    scale = f"0 mL is perfect agreement, {nothing.best_ml:.2f} mL a model without deformation."
     if len(ranked) == 1:
         between = f"Area between the strain-volume curves of {best.model} and the measurement {where}"
         return f"{between}: {area}; {scale}{caveat}"

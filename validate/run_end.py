@@ -1,6 +1,7 @@
 """Whether the run that wrote a result reached its end, by its log or deck beside it, or by its time."""
 
 import re
+from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
@@ -65,18 +66,20 @@ def _of_the_run_beside(place: Path) -> EarlyEnd | None:
     """The end of the run from which a file was exported."""
     for result in map(place.with_suffix, (".xplt", ".frd")):
         if result.is_file():
-            try:
-                return early_end(result)
-            except ImageFileError:  # it is not what is compared
-                return None
+            with suppress(ImageFileError):  # it is not what is compared
+                if (end := early_end(result)) is not None:
+                    return end
     log, status, deck = map(place.with_suffix, (".log", ".sta", ".inp"))
-    if "E R R O R   T E R M I N A T I O N" in _ends_of(log):
+    said = _ends_of(log)
+    if "E R R O R   T E R M I N A T I O N" in said:
         return EarlyEnd(f"ended with ERROR TERMINATION ({log.name})", certain=True)
+    if _BANNER in said and "N O R M A L   T E R M I N A T I O N" not in said:
+        return EarlyEnd(f"has no end in its log ({log.name})", certain=True)
     said = _ends_of(status)
     if "THE ANALYSIS HAS NOT BEEN COMPLETED" in said:  # Abaqus
         return EarlyEnd(f"was not completed ({status.name})", certain=True)
-    *_, last = (None, *re.findall(r"^(?:\s+\d+){4}\s+([.\dE+-]+)\s+[.\dE+-]+\s+[.\dE+-]+\s*$", said, re.MULTILINE))
-    return None if last is None else _compared(float(last), _calculix_time(deck), deck.name)
+    times = re.findall(r"^(?:\s+\d+){4}\s+(\d*\.\d+(?:E[+-]\d+)?)(?:\s+[.\dE+-]+){2}\s*$", said, re.MULTILINE)
+    return _compared(float(times[-1]), _calculix_time(deck), deck.name) if times else None
 
 
 def _compared(time: float | None, whole: float | None, deck: str) -> EarlyEnd | None:

@@ -22,6 +22,7 @@ _NEAR_MM = 2.5, 6.0  # distances of the voxels that it is compared with
 _BETTER = 1.2  # on heels, mirror images have at most 0.87 times the sharpness of a right mask
 _FOLLOWS = 1.2  # right masks of heels have 2.0 and more, those a voxel off 1.3 and more (benchmarks.bone_masks)
 _LIES = 1.3  # of a mirrored mask that is right: one a voxel off has 1.2 and more, and in other places up to 1.2
+_THICKEST_MM = 2.5  # across thicker slices, an edge is as wide as what it is compared with
 _FROM_AIR_MM = 3.0
 _MORE = 1.02  # times the sharpest of those about the image's middle, one of which it is where the origin lies there
 _LEAST, _MOSTLY = 500, 0.5  # voxels of the mask, and the fraction of them that lies on the image in the other frame
@@ -52,9 +53,9 @@ def mask_doubt(image: Image, bone: Mask, body: Mask) -> str:
         (sharpness,) = _sharpness(other, [gradient])
         if sharpness > _MORE * max(of_flips):
             found["with the signs of L and P reversed"] = sharpness
-    best = max(found, key=lambda how: found[how])
+    best = max(found, key=lambda how: np.nan_to_num(found[how]))
     if not found[best] > max(_BETTER * own, _LIES):
-        return _edgeless(follows) if follows < _FOLLOWS else ""
+        return _edgeless(follows) if follows < _FOLLOWS and image.grid.spacing_mm.max() <= _THICKEST_MM else ""
     return (
         f"The bone mask may be mirrored or in another frame (RAS for LPS): {best}, its surface would follow the edges "
         f"of the unloaded image better (sharpness {found[best]:.2f} instead of {own:.2f}). Check it on the unloaded "
@@ -71,20 +72,21 @@ def _edgeless(sharpness: float) -> str:
 
 
 def edge_sharpness(image: Image, bone: Mask, body: Mask) -> float:
-    """Median gradient of an image at the surface of a bone mask, over that 2.5 to 6 mm from it; 0 without a surface.
+    """Median gradient of an image at the surface of a bone mask, over that 2.5 to 6 mm from it.
 
-    The masks are on its grid. Only the surface more than 3 mm inside the body counts.
+    The masks are on its grid. Only the surface more than 3 mm inside the body counts; NaN if there is none.
     """
     return _inner_sharpness(_gradient(image), bone, body)
 
 
 def _inner_sharpness(gradient: Float32Array, bone: Mask, body: Mask) -> float:
     """Sharpness of a mask on an image of such a gradient, away from the surface of the body."""
+    if not bone.inside.any():
+        return float("nan")
     edges = bone.grid.spacing_mm
     box = bone.box(int(np.ceil((_NEAR_MM[1] + _FROM_AIR_MM) / edges.min())) + 1)
-    if not bone.inside.any():
-        return 0.0
-    deep = distance_transform_edt((body.inside | bone.inside)[box], edges) > _FROM_AIR_MM
+    tissue = (body.inside | bone.inside)[box]
+    deep = tissue if tissue.all() else distance_transform_edt(tissue, edges) > _FROM_AIR_MM
     return _sharpness(Mask(bone.grid.part(box), bone.inside[box]), [gradient[box]], deep)[0]
 
 
@@ -129,8 +131,8 @@ def _sharpness(bone: Mask, gradients: Sequence[Float32Array], where: BoolArray |
 
 
 def _contrast(gradient: Float32Array, at: BoolArray, near: BoolArray) -> float:
-    """Median of a gradient at a surface over that near it; 0 where no voxel is at or near it."""
+    """Median of a gradient at a surface over that near it; NaN where no voxel is at or near it."""
     if not (at.any() and near.any()):
-        return 0.0
+        return float("nan")
     beside = float(np.median(gradient[near]))
     return float(np.median(gradient[at])) / beside if beside > 0.0 else 0.0

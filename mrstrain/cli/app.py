@@ -100,7 +100,7 @@ def main() -> None:
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     if (closed := getattr(signal, "SIGHUP", None)) and signal.getsignal(closed) == signal.SIG_DFL:  # not under nohup
-        signal.signal(closed, lambda *_: sys.exit(128 + signal.SIGTERM))
+        signal.signal(closed, _closed)
     signal.signal(signal.SIGINT, _interrupted)
     atexit.register(gc.freeze)  # half a second of collecting what ends with the process anyway
     try:
@@ -129,6 +129,14 @@ def _interrupted(*_: object) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     typer.echo("\nStopping...", err=True)
     raise KeyboardInterrupt
+
+
+def _closed(*_: object) -> None:
+    """End like SIGTERM where the terminal is closed; what is still said goes nowhere, as writing to it would fail."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nowhere, stream)
+    sys.exit(128 + signal.SIGTERM)
 
 
 def _share_arenas() -> None:

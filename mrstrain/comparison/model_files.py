@@ -95,26 +95,30 @@ def with_variants(
     bases: dict[tuple[Path, str], ModelFile] = {}
     notes = list[str]()
 
-    def file(place: Path, model: str, load: str) -> ModelFile | None:
+    def lacking(place: Path, load: str) -> str:
+        """Why a folder has no result of a load that can be used; empty if it has one."""
         chosen, reached = _chosen(place, [load])[1] if place.is_dir() else {}, _outcome(place, "reached")
         if load not in chosen or (reached is not None and reached.get(load, 0.0) < 1.0):
-            return None
-        if (end := early_end(chosen[load])) and end.certain and not usual.unfinished:
-            notes.append(f"{chosen[load]}: the run {end.reason}; this solution is not used.")
-            return None
-        return ModelFile(model, chosen[load], *_reading(place, usual, to_image))
+            return f"has no result for {load}"
+        end = early_end(chosen[load])
+        if end is not None and end.certain and not usual.unfinished:
+            return f"is left out for {load}, because the run of {chosen[load]} {end.reason}"
+        return ""
+
+    def file(place: Path, model: str, load: str) -> ModelFile:
+        return ModelFile(model, _chosen(place, [load])[1][load], *_reading(place, usual, to_image))
 
     def with_own(model: ModelFile, load: str) -> ModelFile:
         found = []
         for one in (folder for folder in folders if folder.record.model == model.name):
-            base, varied = None, file(one.place, model.name, load)
+            places = [one.place, *([] if one.base is None else [one.base])]
+            if why := next(filter(None, (lacking(place, load) for place in places)), ""):
+                notes.append(f"{model.name}: the variant of '{one.record.input}' {why}.")
+                continue
+            base = None
             if one.base is not None:
-                made = file(one.base, model.name, load)
-                base = None if made is None else bases.setdefault((one.base.resolve(), load), made)
-            if varied is None or (one.base is not None and base is None):
-                notes.append(f"{model.name}: the variant of '{one.record.input}' has no result for {load}.")
-            else:
-                found.append(VariantFile(one.record.input, one.record.steps, varied, base))
+                base = bases.setdefault((one.base.resolve(), load), file(one.base, model.name, load))
+            found.append(VariantFile(one.record.input, one.record.steps, file(one.place, model.name, load), base))
         return replace(model, variants=tuple(found))
 
     return {load: [with_own(model, load) for model in of] for load, of in files.items()}, notes

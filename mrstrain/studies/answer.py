@@ -15,9 +15,10 @@ from validate.load_comparison import STRAINED
 _NEAREST = (
     " Best match: the model with the smallest area between its strain-volume curve and the measured one in that tissue "
     "alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, so another "
-    "model may be best. In brackets: models whose 95 % interval overlaps with that of the best match; no significance "
-    "test is made for a single tissue. None: no model has a smaller area than one without deformation. A dash: hardly "
-    "any of this tissue is strained (less than 1 % above {low:g}), so its areas are not informative."
+    "model may be best. In brackets: other models that are better than no deformation and may be as good, since their "
+    "95 % intervals overlap with that of the best match, or are not known; no significance test is made for a single "
+    "tissue. None: no model is better than no deformation. A dash: hardly any of this tissue is strained (less than "
+    "1 % above {low:g}), so its areas are not informative."
 )
 
 
@@ -65,9 +66,9 @@ def _nearest(comparison: Comparison) -> Mapping[tuple[str, str], str]:
         if above < STRAINED * whole:
             continue
         areas = [a for a in comparison.areas if (a.load, a.tissue) == (curve.load, curve.tissue) and not a.levelled]
-        (limit,) = [a.best_ml for a in areas if a.model == NOTHING]
+        limit = next((a.best_ml for a in areas if a.model == NOTHING), np.inf)
         better = sorted((a for a in areas if a.best_ml < limit), key=lambda a: a.best_ml)
-        near = [other.model for other in better[1:] if other.low_ml <= better[0].high_ml]
+        near = [other.model for other in better[1:] if not other.low_ml > better[0].high_ml]  # or not known
         best = better[0].model if better else "none"
         found[curve.load, curve.tissue] = f"{best} ({', '.join(near)})" if near else best
     return found

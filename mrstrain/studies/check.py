@@ -317,8 +317,8 @@ class _Look:
             laws = self.laws_of(one, mesh.regions)
             if laws is not None and pressed:
                 problems = self.tried(problems_of, mesh, laws, plates, pressed, held, study.models.element) or []
-                odd = [note for each in problems for note in self.tried(_notes, each) or ()]
-                self.notes += [f"WARNING: {note}" for note in dict.fromkeys(odd)]
+                odd = [f"WARNING: {note}" for each in problems for note in self.tried(_notes, each) or ()]
+                self.notes += [note for note in dict.fromkeys(odd) if note not in self.notes]
 
     def laws_of(self, one: MaterialSet, regions: Iterable[str]) -> Mapping[str, Material] | None:
         """The materials of a set by region, with warnings about odd ones."""

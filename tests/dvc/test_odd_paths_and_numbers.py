@@ -12,6 +12,7 @@ import dvc
 import fe
 import mrstrain
 from dvc.errors import InputError, OutputError
+from dvc.file_names import refuse_path
 from dvc.io.images.labels import read_names
 from dvc.io.transforms.itk_file import read_itk_transform
 from dvc.own_files import parse_json, parse_toml
@@ -27,6 +28,8 @@ NOT_UTF8 = os.fsdecode(b"M\xfcller")
 def test_nesting_without_end_is_refused(read: Callable[[str], object]) -> None:
     with pytest.raises(ValueError, match="nested too deeply"):
         read(DEEP if read is parse_json else f"a = {DEEP}")
+    with pytest.raises(ValueError, match="nested too deeply"):
+        read('{"a":' * 100_000 if read is parse_json else f"{'.'.join('a' * 3000)} = 1")
 
 
 def test_whole_numbers_are_refused_from_64_bits_on() -> None:
@@ -81,6 +84,12 @@ def test_a_label_of_thousands_of_digits_is_no_label(tmp_path: Path) -> None:
 def test_a_path_that_no_file_can_have_is_refused(call: Callable[[str], object], path: str, why: str) -> None:
     with pytest.raises(InputError, match=why):
         call(path)
+
+
+def test_the_longest_name_is_that_of_most_bytes() -> None:
+    with pytest.raises(InputError, match="a name of 400 bytes"):
+        refuse_path("é" * 200 + "/" + "a" * 201)
+    refuse_path("\ud800")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="paths are Unicode there")

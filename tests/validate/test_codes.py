@@ -280,9 +280,12 @@ def test_what_was_exported_from_a_run_is_judged_by_what_lies_beside_it(
     status.write_text(status.read_text().replace("0.400000E+00", "0.100000E+01"))
     assert early_end(tmp_path / f"Load1{ending}") is None
     status.write_text(" THE ANALYSIS HAS NOT BEEN COMPLETED\n")
+    (tmp_path / "Load1.frd").write_text("damaged")  # another file is what is compared
     assert early_end(tmp_path / f"Load1{ending}") == ("was not completed (Load1.sta)", True)
-    (tmp_path / "Load1.frd").write_text("damaged")
-    assert early_end(tmp_path / f"Load1{ending}") is None  # another file is what is compared
+    status.write_text("  1  2  3  4  ---  ---  ---\n")
+    assert early_end(tmp_path / f"Load1{ending}") is None
+    (tmp_path / "Load1.log").write_text("F O R   B I O M E C H A N I C S\n")
+    assert early_end(tmp_path / f"Load1{ending}") == ("has no end in its log (Load1.log)", True)
 
 
 def test_a_run_that_failed_before_its_first_state_has_no_time(folder: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from dvc.images.tissue import tissue_mask
 from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
 from dvc.measurement.subject import Subject
-from dvc.registration.bone_mask import mask_doubt
+from dvc.registration.bone_mask import edge_sharpness, mask_doubt
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Settings, register
 from phantoms import Heel, heel_grid, heel_pair, labels_of, scan
@@ -99,7 +99,19 @@ def test_a_mask_that_follows_no_edge_is_told_and_one_that_is_a_voxel_off_is_not(
     given = masks(bone, body, seed=1)
     for name in ("right", "a voxel too large", "a voxel too small"):
         assert mask_doubt(image, given[name], body) == "", name
-    assert "follows no edge inside the unloaded image" in mask_doubt(image, given[wrong], body)
+    known = not np.isnan(edge_sharpness(image, given[wrong], body))
+    assert ("follows no edge inside the unloaded image" in mask_doubt(image, given[wrong], body)) == known
+    assert known or wrong == "upper half of the body"  # whose surface in thick slices is all near the air
+
+
+def test_a_thin_body_and_thick_slices_raise_no_doubt(tiny_pair):
+    """All of the surface is near the air, or an edge as wide as what it is compared with."""
+    grid, inside = tiny_pair.reference.grid, tiny_pair.bone.inside
+    noise, everywhere = np.random.default_rng(1).normal(100.0, 10.0, grid.shape), np.ones(grid.shape, dtype=bool)
+    assert mask_doubt(Image(grid, noise), Mask(grid, inside), Mask(grid, everywhere))
+    assert mask_doubt(Image(grid, noise), Mask(grid, inside), Mask(grid, inside)) == ""
+    thick = replace(grid, spacing_mm=np.array([2.3, 2.3, 4.0]))
+    assert mask_doubt(Image(thick, noise), Mask(thick, inside), Mask(thick, everywhere)) == ""
 
 
 def test_noise_has_no_edge_and_a_mask_at_the_ends_of_the_image_raises_no_error(tiny_pair):

@@ -57,9 +57,9 @@ def test_a_variant_whose_run_ended_early_is_told_and_left_out(study: Path) -> No
     files, _ = model_files(list(LOADS), [study / "right"], ModelReading())
     found, notes = with_variants(files, variant_folders([place]), ModelReading())
     assert [len(found[load][0].variants) for load in LOADS] == [0, *(1 for _ in others)]
-    assert notes[0].endswith(
-        f"{first}.vtu: the run ended with ERROR TERMINATION ({first}.log); this solution is not used."
-    )
+    (told,) = notes
+    assert told.startswith(f"right: the variant of 'force' is left out for {first}, because the run of {place}")
+    assert told.endswith(f"{first}.vtu ended with ERROR TERMINATION ({first}.log).")
     asked, notes = with_variants(files, variant_folders([place]), ModelReading(unfinished=True))
     assert (len(asked[first][0].variants), notes) == (1, [])
 
