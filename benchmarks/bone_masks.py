@@ -60,6 +60,12 @@ def rim(image: Image, mask: Mask) -> float:
     return float(np.median(image.values[outer]) / np.median(image.values[inner])) if inner.any() else float("nan")
 
 
+def _range(values: list[float]) -> list[float]:
+    """The smallest, median and largest of the values that are known; empty without any."""
+    known = [value for value in values if not np.isnan(value)]
+    return np.quantile(known, [0.0, 0.5, 1.0]).round(2).tolist() if known else []
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bone_masks")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/bone_masks.json"))
@@ -73,15 +79,9 @@ def main() -> None:
             values = found.setdefault(name, {"edge": [], "rim": []})
             values["edge"].append(edge_sharpness(image, mask, body))
             values["rim"].append(rim(image, mask))
-    ranges = {
-        name: {measure: np.nanquantile(values, [0.0, 0.5, 1.0]).round(3).tolist() for measure, values in of.items()}
-        for name, of in found.items()
-    }
+    ranges = {name: {measure: _range(values) for measure, values in of.items()} for name, of in found.items()}
     for name, of in ranges.items():
-        print(
-            f"{name:24}",
-            *(f"{measure} {low:.2f} {middle:.2f} {high:.2f}" for measure, (low, middle, high) in of.items()),
-        )
+        print(f"{name:24}", *(f"{measure} {' '.join(map(str, known)) or '-'}" for measure, known in of.items()))
     command = "python -m benchmarks.bone_masks"
     record = {"command": command, "versions": versions(), "images": len(SEEDS) * len(SPACINGS) * len(SNRS)}
     asked.out.write_text(json.dumps(record | {"least_median_most": ranges}, indent=2) + "\n")
