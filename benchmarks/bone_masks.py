@@ -22,8 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, shift
 
-from dvc import Image, Mask
-from dvc.images.tissue import tissue_mask
+from dvc import Image, Mask, tissue_mask
 from dvc.registration.bone_mask import edge_sharpness
 from mrstrain.records.provenance import versions
 from phantoms import Heel, heel_grid, labels_of, scan

@@ -18,8 +18,18 @@ from dvc.labelling.tissues import NAMES
 from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
-from fe import BONE, Material, MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
-from fe.problem import Problem
+from fe import (
+    BONE,
+    Material,
+    MaterialSet,
+    Plate,
+    Problem,
+    check_loads,
+    check_meshing,
+    fixed_facets,
+    material_set,
+    problems_of,
+)
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.acquisition import AcquisitionOptions

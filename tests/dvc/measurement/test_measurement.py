@@ -246,7 +246,9 @@ def test_images_that_were_aligned_as_a_whole_have_no_figures_of_a_bone(stretched
     assert "Rotation of the bone" in rows["bone"]
     assert "Rotation of the body" in rows["image"]
     assert "bone" not in rows["image"]
-    assert stretched.drawings()["strain"].caption.endswith("Slices through the middle of the tissue.")
+    assert stretched.drawings()["strain"].caption.endswith(
+        "Slices through the middle of the tissue. The colour scale ends at 0.5, whatever the load."
+    )
 
 
 def test_a_notebook_shows_the_verdict_a_picture_and_a_table_all_escaped(stretched):
