@@ -3,7 +3,7 @@
 import copy
 import pickle
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -72,5 +72,8 @@ def test_what_a_measurement_knows_goes_into_the_comparison() -> None:
     one = validate.LoadCase.of("Load1", measured, [model])
     assert one.verdict == measured.verdict
     assert one.aligned_on == "none"
+    pressed = replace(subject, axes=dvc.plate_axes(subject.plate_normal, (0.0, -1.0, 0.0)))  # the plate is below
+    known = validate.LoadCase.of("Load1", dvc.Measurement.from_deformation(sheared(0.8), pressed), [model])
+    np.testing.assert_array_equal(known.axes, one.axes)  # by default, the force presses upward
     area = next(a for a in validate.compare([one], labels(), bones=["bone"]).areas if a.model == "a")
     assert area.ml == pytest.approx(0.0, abs=1e-6)

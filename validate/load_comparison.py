@@ -76,8 +76,8 @@ class LoadCase:
         Returns the measured deformation (tissue relative to its bone, reference configuration, LPS mm) and the results
         of the models. It is called whenever they are needed, so that files can be read again instead of kept in memory.
     axes : (3, 3)
-        Of the plate, LPS; see `dvc.plate_axes`. By default the plate presses in superior and shears in anterior
-        direction.
+        Of the plate, LPS, the first in the direction of its normal force; see `dvc.plate_axes`. By default the plate
+        presses in superior and shears in anterior direction.
     error, verdict : ErrorTable, Verdict, or None
         Error of the measured maximum shear strain, and the verdict on the measurement. Without the error, results have
         no intervals and no difference is significant.
@@ -122,7 +122,8 @@ class LoadCase:
         error = known.table if error is None and known is not None else error
         on, read = str(measured.alignment.get("on", "")), partial(_given, measured.deformation, results)
         case = cls(load, read, error=error, verdict=measured.verdict, aligned_on=on)
-        return case if axes is None else replace(case, axes=axes)
+        # Those of a subject begin with the direction from the body to the plate, these with that of its force.
+        return case if axes is None else replace(case, axes=plate_axes(-axes[:, 0], axes[:, 1]))
 
     def fields(self) -> Fields:
         """The measured deformation and the results; InputError without a model, or if two models have the same name."""
