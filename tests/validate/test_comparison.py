@@ -312,7 +312,7 @@ def test_models_behind_the_nearest_that_noise_cannot_order_are_named_too() -> No
         best, area = statement.split(" Area", 1)
         assert best.endswith("(area metric): right, significantly better than every other.")
         assert ("between its strain-volume curve" in area) == ("over all loads" in best)
-    assert f"one without deformation {ranking.nothing.best_ml:.2f} mL." in ranking.statements[0]
+    assert f"{ranking.nothing.best_ml:.2f} mL a model without deformation." in ranking.statements[0]
     assert ranking.not_distinguishable["all loads"] == ((second, third),)
     for load in ("Load1", "Load2"):
         assert [set(pair) for pair in ranking.not_distinguishable[load]] == [{"below", "above"}]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import time
 from collections.abc import Iterator
 from itertools import pairwise
@@ -10,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from dvc.images.image import Grid
 from dvc.report.page import Picture, Section, Table, Viewer, Volume, write_report
 from dvc.report.style import SMALL_PT
 from dvc.trust.verdict import Verdict
 from tests.browser import CHROMIUM, Tab, browser
-from tests.dvc.report.test_page import png
 from tests.page_checks import BROKEN, CUT_OFF, HEADINGS, NO_WEBGL, PALE, TOO_WIDE, UNFOLD, UNNAMED, WIDTHS, opened
 
 BUTTON, BOX = "document.querySelector('.fit')", "document.querySelector('.stack')"
@@ -25,6 +26,13 @@ SMALLEST_LETTER_PX = f"""Math.min(...[...document.querySelectorAll(".stack img")
   .map((one) => {SMALL_PT} / 72 * 96 * one.getBoundingClientRect().width / one.getAttribute("width")))"""
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")
+
+
+def wide() -> bytes:
+    """A picture as wide as most figures, whatever earlier tests have set for figures."""
+    file = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (360, 941, 3), dtype=np.uint8)).save(file, "png")
+    return file.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +53,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "Areas", ("model", "where", *(f"Load{n}" for n in range(6))),
         tuple((model, "0 to 3 mm", *6 * ("0.72 (0.00 to 1.33)",)) for model in ("trebbi", "no deformation")),
     )  # fmt: skip
-    picture = Picture("Strain", "How to read it.", png(), (("unloaded", png()), ("Load1, registered", png())))
+    picture = Picture("Strain", "How to read it.", wide(), (("unloaded", wide()), ("Load1, registered", wide())))
     doubtful = Verdict("caution", ("Bone moves by 0.4 mm (limit: 'Use with care' above 0.3 mm).",))
     sections = [
         Section("Load1", Verdict("trust"), (table,), (picture,), ("What was found.",), summary=table),
