@@ -124,10 +124,9 @@ class Simulation:
         ]
         notes += [
             f"{row.load}: {100.0 * row.crowded_share:.1f} % of {row.region} is compressed below det F {CROWDED:g}. "
-            "There, the solver adds an artificial stiffness that prevents inverted cells, because this material cannot "
-            "carry a pressure above its bulk modulus "
-            f"({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa). Do not interpret strain in these "
-            "cells; use a higher Poisson's ratio or a lower load."
+            "There, the solver adds an artificial stiffness, because this material cannot carry a pressure above its "
+            f"bulk modulus ({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa). Do not interpret strain "
+            "in these cells; use a higher Poisson's ratio or a lower load."
             for row in self.regions
             if row.crowded_share > _CROWD
         ]

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import nullcontext, suppress
-from pathlib import Path
+from contextlib import suppress
 
 import numpy as np
 import psutil
@@ -21,7 +18,7 @@ from loky import process_executor
 import dvc  # whose functions load when they are asked for: the processes of these tests import this file
 from dvc.errors import RegistrationError, WorkerError
 from dvc.memory import hand_memory_back
-from dvc.worker import Worker, each_in_workers, ended_with_parent, side_by_side
+from dvc.worker import Worker, each_in_workers, side_by_side
 from tests.processes import is_gone, wait_for
 
 LONG_S, AT_ONCE_S = 60.0, 50.0
@@ -43,12 +40,6 @@ def _needs_a_library_that_does_not_fit() -> None:
         raise ImportError("_core.so: failed to map segment from shared object")
     except ImportError as lack:
         raise ImportError("scipy.optimize cannot be imported") from lack
-
-
-def holds(told: str, guarded: bool) -> None:
-    with ended_with_parent() if guarded else nullcontext():
-        Path(told).write_text(str(os.getpid()))
-        ctypes.PyDLL(None).sleep(int(LONG_S))  # a call that keeps the interpreter
 
 
 def _killed() -> None:
@@ -233,29 +224,6 @@ def test_a_process_that_is_killed_between_tasks_fails_none():
         os.kill(first, signal.SIGKILL)
         wait_for(lambda: worker._executor._flags.broken)
         assert worker.run("asking", _process)[0] != first
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="a POSIX shell looks for the parent")
-@pytest.mark.parametrize("guarded", [True, False])
-def test_native_code_that_holds_the_interpreter_ends_with_the_parent(tmp_path, guarded):
-    """As the mesher does; without the guard, the thread that looks for the parent does not run."""
-    told = tmp_path / "child"
-    script = f"from tests.dvc.test_worker import *; Worker(threads=1).run('meshing', holds, {str(told)!r}, {guarded})"
-    root = Path(__file__).resolve().parents[2]
-    parent = subprocess.Popen([sys.executable, "-c", script], cwd=root, stderr=subprocess.DEVNULL)
-    wait_for(lambda: told.exists() and told.read_text())
-    child = int(told.read_text())
-    try:
-        parent.kill()
-        parent.wait()
-        if guarded:
-            wait_for(lambda: is_gone(child))
-        else:
-            time.sleep(4.0)
-            assert not is_gone(child)
-    finally:
-        with suppress(ProcessLookupError):
-            os.kill(child, signal.SIGKILL)
 
 
 def test_its_own_errors_come_back_as_they_are():
