@@ -31,7 +31,8 @@ def holds(told: str, guarded: bool) -> None:
 def test_native_code_that_holds_the_interpreter_ends_with_the_parent(tmp_path, guarded):
     """As the mesher does; without the guard, the thread that looks for the parent does not run."""
     told = tmp_path / "child"
-    script = f"from tests.dvc.test_ended_with_parent import *; Worker(threads=1).run('meshing', holds, {str(told)!r}, {guarded})"
+    here = "from tests.dvc.test_ended_with_parent import *"
+    script = f"{here}; Worker(threads=1).run('meshing', holds, {str(told)!r}, {guarded})"
     root = Path(__file__).resolve().parents[2]
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=root, stderr=subprocess.DEVNULL)
     wait_for(lambda: told.exists() and told.read_text())
