@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _POINTS = 200
 _FLAT_MM = 0.1
+_TWO_COLUMNS = 4  # panels at most that stand in two columns: more in two would be taller than a printed page
 _MANY = 30_000  # polygons: beyond, a PDF holds them as an image, which is then the smaller
 _STEEPEST = 0.05  # smallest component of the plate's normal along the normal force at which the plate is drawn
 _LEVEL = 0.1  # length of shear's part across the body below which it runs up or down
@@ -160,7 +161,7 @@ def _slice_panels(
     every = np.concatenate(corners)
     low, high = every.min(axis=0) - _MARGIN_MM, every.max(axis=0) + _MARGIN_MM
     width_mm, height_mm = high - low
-    columns = min(len(titles), 2)
+    columns = min(len(titles), 2 if len(titles) <= _TWO_COLUMNS else 3)
     rows = -(-len(titles) // columns)
     inches = min((WIDTH_IN - _GAP_IN * (columns - 1)) / columns / width_mm, _TALLEST_IN / height_mm)
     w, h = inches * width_mm, inches * height_mm

@@ -16,7 +16,16 @@ from dvc.errors import InputError, few
 from dvc.file_names import refuse_as_file_name
 from dvc.own_files import read_json
 from dvc.report.drawing import png_bytes
-from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
+from dvc.report.page import (
+    MEASUREMENT,
+    WITH_MODELS,
+    Picture,
+    Section,
+    Table,
+    notebook_html,
+    record_lines,
+    write_report,
+)
 from dvc.report.strips import Strip
 from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
@@ -210,7 +219,8 @@ class Comparison:
         }  # fmt: skip
         write_json(target / tables.RECORD, own | about)
         closing, title = closing_sections(self.loads[0].criteria.thresholds, methods, more), "Models and measurement"
-        write_report(target / "report.html", title, self.verdict, sections, closing, record_lines(about))
+        judged, lines = WITH_MODELS if self.warnings else MEASUREMENT, record_lines(about)
+        write_report(target / "report.html", title, self.verdict, sections, closing, lines, judged=judged)
         return tuple(sections), tuple(closing)
 
     @classmethod

@@ -208,31 +208,29 @@ def bands(
     uncertain = sensitivities or {}
 
     def curves_of(shear: FloatArray, strains: FloatArray) -> dict[str, FloatArray]:
-        return {name: volume_above(shear[inside], volumes_ml[inside], strains) for name, inside in tissues.items()}
-
-    def varied_of(shear: FloatArray) -> dict[str, FloatArray]:
-        return {name: _above(shear[inside], volumes_ml[inside], inner) for name, inside in tissues.items()}
+        return {name: _above(shear[inside], volumes_ml[inside], strains) for name, inside in tissues.items()}
 
     def areas(first: FloatArray, second: FloatArray) -> FloatArray:
         return np.asarray(np.trapezoid(np.abs(first - second), dx=inner[1] - inner[0]))
 
     curves = {model: curves_of(shear, inner) for model, shear in models.items()}
-    drawn, perfect = list[dict[str, FloatArray]](), list[dict[str, FloatArray]]()
+    drawn, drawn_outer, perfect = (list[dict[str, FloatArray]]() for _ in range(3))
     varied: dict[str, list[dict[str, FloatArray]]] = {model: [] for model in uncertain}
     wrong: dict[str, list[dict[str, FloatArray]]] = {model: [] for model in uncertain}  # perfect, with wrong inputs
     for number, truth in enumerate(truths):
-        drawn.append(curves_of(truth, np.concatenate([outer, inner])))
+        drawn.append(curves_of(truth, inner))
+        drawn_outer.append(curves_of(truth, outer))
         best = narrowed(truth) if number % _EVERY == 0 else None
         if best is not None:
             perfect.append(curves_of(best, inner))
         for model, sensitivity in uncertain.items():
             change = sensitivity.drawn(number)
-            varied[model].append(varied_of(models[model] + change))
+            varied[model].append(curves_of(models[model] + change, inner))
             if best is not None:
-                wrong[model].append(varied_of(best + np.sqrt(2.0) * change))
+                wrong[model].append(curves_of(best + np.sqrt(2.0) * change, inner))
     result = {}
     for name, inside in tissues.items():
-        on_outer, on_inner = np.split(np.array([of[name] for of in drawn]), [_GRID], axis=1)
+        on_inner, on_outer = (np.array([one[name] for one in of]) for of in (drawn, drawn_outer))
         factor = widening(name)
         least, _, most = widened(on_outer, factor)
         following = on_inner[1::_EVERY]  # the draws after those that serve as perfect models

@@ -213,7 +213,7 @@ class StrainedRegion:
     def _near(self) -> cKDTree:
         return cKDTree(self._points[self.above])
 
-    @property
+    @cached_property
     def centroid_mm(self) -> FloatArray:
         """Reference configuration, LPS mm; NaN for no cell."""
         if not self.above.any():

@@ -50,14 +50,19 @@ def check_models(
 
 def _odd_models(case: LoadCase, labels: LabelMap, bones: Sequence[str]) -> list[str]:
     """Possible input errors of the models of one load."""
-    warnings = []
+    warnings, bone = [], _points_of_bone(labels, bones)
     for result in case.fields()[1]:
         check_overlap(result.path, result.mesh, labels.grid)
         if result.rigid_parts:
             parts = ", ".join(result.rigid_parts)
             warnings.append(f"{case.load}: {result.name} has rigid parts, which are not compared: {parts}.")
-        warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
+        warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones, bone)]
     return warnings
+
+
+def _points_of_bone(labels: LabelMap, bones: Sequence[str]) -> cKDTree:
+    bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
+    return cKDTree(labels.grid.points(bone))
 
 
 def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
@@ -83,12 +88,13 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
     return overlap
 
 
-def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
+def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDTree | None = None) -> list[str]:
     """Check a model against the label map; returns a sentence for each possible input error.
 
     Reported are models with cells that are there twice, of which less than 95 % lies in the labelled soft tissue, whose
     tissue names agree with the label map in under 80 % of the volume, that move by over 1 mm at the bone, or whose mean
-    change of cell volume is over 15 %. Errors as `check_in_tissue`.
+    change of cell volume is over 15 %. Errors as `check_in_tissue`. ``bone`` has the points of the bones' voxels, LPS mm,
+    if they are known already.
     """
     mesh, warnings = result.mesh, []
     if len(again := repeated_rows(np.round(mesh.centroids_mm / _SAME_PLACE_MM))):
@@ -108,8 +114,8 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[st
             f"model and label map have the same tissue name in only {same:.0%} of the volume; check the names, and the "
             "frame of the model."
         )
-    bone = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name in bones]))
-    distance = cKDTree(bone).query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0]
+    of_bone = bone or _points_of_bone(labels, bones)
+    distance = of_bone.query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0]
     moved = np.linalg.norm(result.deformation.u_mm[distance < _NEAR_BONE_MM], axis=1)
     if len(moved) and np.median(moved) > _RIGID_MM:
         warnings.append(

@@ -41,6 +41,8 @@ _WHITE, _CHART_COLOURS = 0.5, 128  # a chart: so much of it is white, and so man
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"
 """Version of the viewer (WebGL 2, niivue.com) that comes with the package; it draws what the page itself holds."""
+MEASUREMENT, WITH_MODELS = "Measurement", "Measurement and model files"
+"""What a verdict is on: the measurement, or also the files of models, where there is something odd in them."""
 METHODS = "Methods text"
 """Title of a report's section with paragraphs for a methods section."""
 
@@ -275,17 +277,18 @@ def write_report(
     closing: Sequence[Section],
     provenance: Mapping[str, str],
     *,
+    judged: str = MEASUREMENT,
     notes: Sequence[str] = (),
     reload_s: int | None = None,
 ) -> None:
     """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
-    One HTML file without anything to fetch. All text is escaped, and a browser runs no script but those of this
-    package. With two sections or more a list of them, with their verdicts, stands beside them. ``notes``, a line each,
-    stand below the verdict. Closing sections and provenance are folded. A browser loads a page anew every ``reload_s``
-    seconds. OutputError if the file cannot be written.
+    The verdict is on what is ``judged``. One HTML file without anything to fetch. All text is escaped, and a browser
+    runs no script but those of this package. With two sections or more a list of them, with their verdicts, stands
+    beside them. ``notes``, a line each, stand below the verdict. Closing sections and provenance are folded. A browser
+    loads a page anew every ``reload_s`` seconds. OutputError if the file cannot be written.
     """
-    told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance, "closing": closing}
+    told = {"title": title, "judged": judged, "verdict": verdict, "notes": notes}
     volumes: dict[str, str] = {}  # each once, however many viewers show it
     for viewer in (viewer for section in sections for viewer in section.viewers):
         for volume in (viewer.image, *viewer.overlays):
@@ -296,8 +299,8 @@ def write_report(
     style, script, library = stored("page.css"), stored("page.js"), _library() if volumes else None
     scripts = [script, library["script"], library["code"]] if library else [script]
     page = template("report", alike=alike, unbroken=unbroken, wrapping=wrapping).render(
-        **told, sections=sections, volumes=volumes, style=style, script=script, library=library,
-        policy=policy(style, scripts, viewer=bool(volumes)), reload_s=reload_s, beneath={},
+        **told, sections=sections, closing=closing, provenance=provenance, volumes=volumes, style=style, script=script,
+        library=library, policy=policy(style, scripts, viewer=bool(volumes)), reload_s=reload_s, beneath={},
     )  # fmt: skip
     write_whole(path, page)
 

@@ -1,6 +1,9 @@
 """`compare`: comparison of finite-element models of any code with a measurement, from files to a report."""
 
+import pickle
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -129,7 +132,6 @@ def compare(
         )
     common = None if comparison.mesh is None else _common_mesh(comparison.mesh, tissues, bones)
     compared = {m.load: m for m in measurements if m.load in files}
-    cases = [_case(m, files[load], tissues.grid, own.get(load, axes)) for load, m in compared.items()]
     given = {
         "bones": list(bones), "plate_axes_lps": axes.tolist(), "strains": list(criteria.strains),
         "plate_axes_lps_of": {load: of.tolist() for load, of in own.items()}, "least_cluster_ml": criteria.least_ml,
@@ -138,11 +140,17 @@ def compare(
         "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
     }  # fmt: skip
     folders, of_models = {load: m.folder for load, m in compared.items()}, {file.name: file.path for file in results}
-    with side_by_side("comparing", _at_once(len(cases))) as each:
+    with (
+        tempfile.TemporaryDirectory(prefix="mrstrain-") as kept,
+        side_by_side("comparing", _at_once(len(compared))) as each,
+    ):
+        cases = [
+            _case(m, files[load], tissues.grid, own.get(load, axes), Path(kept) / load) for load, m in compared.items()
+        ]
         reading_each, comparing_each, writing_each = (
             partial(_told, each, partial(tell, "compare", what)) for what in ("reading", "comparing", "writing")
         )
-        # Every file is read once before anything is removed, and again when needed: together they would fill memory.
+        # Every file is read before anything is removed; what was read is kept on the disk, as it would fill memory.
         warnings = validate.check_models(cases, tissues, bones, each=reading_each)
         with output_folder(target), alone(target):
             record = provenance("compare", inputs, given)
@@ -187,13 +195,24 @@ def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
     return mesh
 
 
-def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> validate.LoadCase:
+def _case(
+    measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray, kept: Path
+) -> validate.LoadCase:
     image, known = measurement.folder / REGISTERED, (measurement.table, measurement.verdict, measurement.aligned_on)
-    read = partial(_read, measurement, files, grid)
+    read = partial(_read, measurement, files, grid, kept)
     return validate.LoadCase(measurement.load, read, axes, *known, image if image.is_file() else None)
 
 
 def _read(
-    measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid
+    measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, kept: Path
 ) -> tuple[Deformation, list[validate.FeResult]]:
-    return measurement.deformation(), [file.read(grid) for file in files]
+    """The measured deformation, and the results in the files of models; ``kept`` holds these once they were read."""
+    if kept.exists():
+        with kept.open("rb") as file:
+            return measurement.deformation(), pickle.load(file)
+    results, part = [file.read(grid) for file in files], kept.with_name(f"{kept.name}.part")
+    with suppress(OSError):  # a disk without room: they are read again
+        with part.open("wb") as file:
+            pickle.dump(results, file, protocol=pickle.HIGHEST_PROTOCOL)
+        part.replace(kept)
+    return measurement.deformation(), results

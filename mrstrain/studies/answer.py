@@ -12,6 +12,7 @@ from mrstrain.measurement.answer import NOTHING_BESIDE, MeasuredBeside, most_str
 from validate import NOTHING, Comparison
 from validate.load_comparison import STRAINED
 
+_AREAS = "Areas of all models and loads"
 _NEAREST = (
     " Best match: the model with the smallest area between its strain-volume curve and the measured one in that tissue "
     "alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, so another "
@@ -29,7 +30,8 @@ def answer_of(
     """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
 
     It begins with the most strained tissue. Its table has a row for each load and tissue: the measured maximum shear
-    strain, and the best match. Without a comparison it has ``pictures`` of the measured strain.
+    strain, and the best match. Without a comparison it has ``pictures`` of the measured strain; with one, its areas
+    are folded.
     """
     table = table_of_loads(measured)
     words = most_strained(table, beside)
@@ -46,7 +48,9 @@ def answer_of(
         note = table.note + _NEAREST.format(low=comparison.strains[0])
         table = replace(table, columns=(*table.columns, "best match"), rows=rows, note=note)
     paragraphs = (*words, *compared[0].paragraphs)
-    return [replace(compared[0], tables=(table, *compared[0].tables), paragraphs=paragraphs)]
+    first = replace(compared[0], tables=(table,), paragraphs=paragraphs)
+    areas = [Section(_AREAS, None, compared[0].tables, folded=True)] if compared[0].tables else []
+    return [first, *areas]
 
 
 def _comparison(folder: Path) -> Comparison | None:

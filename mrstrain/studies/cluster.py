@@ -83,6 +83,7 @@ class StageRunner:
         self._client, self._watch = client, watch
         self._local = local  # workers for this run alone
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
+        self._waiting: list[_Call] = []  # for a worker that is free
         self._under_way: dict[Future[Any], _Call] = {}
         self._died: list[_Call] = []  # to be tried once more
         self._finished: queue.Queue[Future[Any]] = queue.Queue()
@@ -106,7 +107,20 @@ class StageRunner:
         Of the waiting stages, that one is first from whose start the study is expected to take the most seconds. A
         stage that fails for lack of memory tells what it is expected to need.
         """
-        self._submit(_Call(name, function, dict(arguments), str(lock), to_end_s, gib))
+        self._waiting.append(_Call(name, function, dict(arguments), str(lock), to_end_s, gib))
+        self._send()
+
+    def _send(self) -> None:
+        """Send waiting stages to free workers; to one that may still come, if there is none.
+
+        Dask gives a stage to a worker at once, even to one that is busy for minutes while another soon has no work.
+        """
+        connected = self._client.status == "running"
+        slots = (connected and sum(self._client.nthreads().values())) or 1
+        while self._waiting and len(self._under_way) < slots:
+            call = max(self._waiting, key=lambda one: one.to_end_s)
+            self._waiting.remove(call)
+            self._submit(call)
 
     def _submit(self, call: _Call) -> None:
         key = f"{call.name.replace(' ', '-')}-{uuid.uuid4().hex}"
@@ -120,6 +134,7 @@ class StageRunner:
         A stage that a process of died is tried once more, on one core, when no other is under way: its memory may have
         run out. One that hangs is ended.
         """
+        self._send()
         if not self._under_way and self._died:
             self._submit(self._died.pop(0))
         lost_since: float | None = None
@@ -128,6 +143,7 @@ class StageRunner:
                 future = self._finished.get(timeout=_LOOK_EVERY_S)
                 break
             except queue.Empty:
+                self._send()  # where workers have come
                 # Dask tells the end of a stage in a thread of its own, which there may be no memory for.
                 if ended := [one for one in self._under_way if one.done()]:
                     future = ended[0]
@@ -156,7 +172,8 @@ class StageRunner:
                 again = isinstance(outcome, StageResult) and lines
                 return name, replace(outcome, lines=(*outcome.lines, *lines)) if again else outcome, seconds
             if isinstance(error, KilledWorker) and not (begun or call.died) and call.lost < _MOST_LOST:
-                self._submit(replace(call, lost=call.lost + 1))  # Dask blames all that wait for a worker that dies
+                # Dask blames all that wait for a worker that dies
+                self._waiting.append(replace(call, lost=call.lost + 1))
                 return self.next()
             if call.died:
                 needs = f"; its estimated memory need is {call.gib:.1f} GiB" if call.gib else ""
@@ -198,9 +215,7 @@ class StageRunner:
             if nanny.worker_address in places:  # what hangs in native code would not notice that its worker is gone
                 _kill(_processes_of(nanny)[1:])
         self._client.restart_workers([*places], raise_for_error=False)
-        for waiting in calls:
-            if waiting is not call:
-                self._submit(waiting)
+        self._waiting += [waiting for waiting in calls if waiting is not call]
         return (
             call.name,
             f"It made no progress for {duration(silent_s)} and was stopped. The usual causes are a network disk that "
@@ -216,7 +231,7 @@ class StageRunner:
     @property
     def busy(self) -> bool:
         """Whether a stage is running or waiting."""
-        return bool(self._under_way or self._died)
+        return bool(self._waiting or self._under_way or self._died)
 
 
 def _death(error: BaseException) -> WorkerError | None:

@@ -10,7 +10,17 @@ from dvc.errors import MrstrainError
 from dvc.io.result_folder import PROVENANCE
 from dvc.measurement.page import STRAIN
 from dvc.measurement.side_by_side import FIGURE, measured_by_load
-from dvc.report.page import METHODS, Cell, Picture, Section, Table, record_lines, write_report
+from dvc.report.page import (
+    MEASUREMENT,
+    METHODS,
+    WITH_MODELS,
+    Cell,
+    Picture,
+    Section,
+    Table,
+    record_lines,
+    write_report,
+)
 from dvc.trust.verdict import worst
 from mrstrain.comparison.credibility import TITLE as CREDIBILITY
 from mrstrain.comparison.methods import methods_of_registrations
@@ -67,7 +77,9 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     verdict = _verdict(
         [s.verdict.among(s.title) for of in of_loads.values() for s in of.sections if s.verdict], compared
     )
-    write_report(path, study.study.name, verdict, sections, closing, record_lines(record), notes=_incomplete(outcomes))
+    judged = WITH_MODELS if any(one.verdict for one in compared[:1]) else MEASUREMENT
+    lines, notes = record_lines(record), _incomplete(outcomes)
+    write_report(path, study.study.name, verdict, sections, closing, lines, judged=judged, notes=notes)
 
 
 def _folders(study: Study, outcomes: Mapping[str, StageOutcome]) -> dict[str, Path]:

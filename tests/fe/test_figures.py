@@ -52,3 +52,16 @@ def test_a_slice_lies_as_radiologists_read_it_whichever_way_the_plate_shears(
     assert sides(whole) == letters
     middles = {of.get_label(): np.mean([p.vertices[:, 0].mean() for p in of.get_paths()]) for of in whole.collections}
     assert middles["skin"] < middles["fat"]
+
+
+@pytest.mark.parametrize(("count", "columns"), [(1, 1), (2, 2), (4, 2), (5, 3), (7, 3)])
+def test_many_slices_stand_in_three_columns_so_that_they_fit_on_a_printed_page(count: int, columns: int) -> None:
+    plate = Plate(-np.array(UP), np.array(ANTERIOR))
+    mesh, along = halves(np.array(UP), np.array(LEFT))
+    field = Slice("one", np.zeros_like(mesh.points_mm), 0.1 + 0.01 * along)
+    figure = slice_sheet(mesh, [field] * count, plate.axes, np.full(3, 6.0))
+    spots = [axes for axes in figure.axes if axes.get_title() == "one"]
+    assert len(spots) == count
+    assert len({round(axes.get_position().x0, 4) for axes in spots}) == columns
+    width, height = figure.get_size_inches()
+    assert height < 1.3 * width or count < 3

@@ -140,7 +140,7 @@ def test_links_of_the_contents_lead_to_the_parts(html: str) -> None:
 def test_verdict_stands_before_all_else_and_in_words(html: str) -> None:
     body = html[html.index("<main>") :]
     assert body.index('class="verdict distrust"') < body.index("<details")
-    assert "Do not trust" in body
+    assert "<strong>Measurement: Do not trust</strong>" in body
     assert '<span class="pill trust">Trust</span>' in body
     contents = html[html.index("<nav") : html.index("</nav>")]
     assert "Do not trust" in contents

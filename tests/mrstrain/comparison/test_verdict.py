@@ -57,7 +57,7 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
     alone = json.loads((study / "out" / "Load2" / "provenance.json").read_text())
     assert alone["verdict"]["level"] == "distrust"
     page = (study / "out" / "report.html").read_text().partition("<main>")[2]
-    box = page.index('<div class="verdict distrust">')
+    box = page.index('<div class="verdict distrust"><strong>Measurement')
     assert box < page.index("Models and loads") < page.index("Load2 (do not trust)")
     assert reason in page[box : page.index("Models and loads")]
 
@@ -90,6 +90,8 @@ def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(stu
     assert section.verdict is not None
     assert section.verdict.level == "caution"
     assert section.verdict.reasons == tuple(others)
+    page = (study / "out" / "report.html").read_text()
+    assert "<strong>Measurement and model files: Do not trust</strong>" in page
 
 
 def test_what_is_refused_leaves_an_earlier_comparison_whole(plain, study: Path) -> None:

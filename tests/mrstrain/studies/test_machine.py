@@ -183,6 +183,35 @@ def test_a_stage_whose_process_died_is_tried_once_more_when_it_is_alone(tmp_path
     assert expected in (ended["big"] if deaths == 2 else ended["big"].lines)
 
 
+def test_a_stage_waits_for_whichever_worker_is_free_first_and_the_longest_goes_first(tmp_path, monkeypatch):
+    """Dask gave stages to a worker that was busy for a minute, and the other had nothing to do."""
+    sent = list[str]()
+    futures = list[Future]()
+
+    def submit(_function: object, _topic: str, call: _Call, **_: object) -> Future:
+        sent.append(call.name)
+        futures.append(Future())
+        futures[-1].status = "finished"
+        return futures[-1]
+
+    machine = Machine()
+    monkeypatch.setattr(machine, "submit", submit)
+    runner = StageRunner(machine, lambda *_: None)
+    for name, to_end_s in (("long", 9.0), ("b", 5.0), ("c", 3.0), ("d", 4.0)):
+        runner.begin(name, "mesh", {}, tmp_path / "lock", to_end_s)
+    assert sent == ["long", "b"]  # there are two workers
+    futures[1].set_result((StageResult(()), 1.0))
+    assert runner.next()[0] == "b"
+    runner.begin("e", "mesh", {}, tmp_path / "lock", 1.0)
+    assert sent[2:] == ["d"]
+    futures[2].set_result((StageResult(()), 1.0))
+    assert runner.next()[0] == "d"
+    futures[0].set_result((StageResult(()), 1.0))
+    assert runner.next()[0] == "long"
+    assert sent[3:] == ["c"]
+    assert runner.busy
+
+
 def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, monkeypatch):
     """It waits for a lock that is never free, in a worker that runs the next stage after that."""
     told = list[tuple[str, str, float]]()
