@@ -93,8 +93,8 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
 
     Reported are models with cells that are there twice, of which less than 95 % lies in the labelled soft tissue, whose
     tissue names agree with the label map in under 80 % of the volume, that move by over 1 mm at the bone, or whose mean
-    change of cell volume is over 15 %. Errors as `check_in_tissue`. ``bone`` has the points of the bones' voxels, LPS mm,
-    if they are known already.
+    change of cell volume is over 15 %. Errors as `check_in_tissue`. ``bone`` has the points of the bones' voxels, LPS
+    mm, if they are known already.
     """
     mesh, warnings = result.mesh, []
     if len(again := repeated_rows(np.round(mesh.centroids_mm / _SAME_PLACE_MM))):

@@ -184,7 +184,7 @@ class Section:
     paragraphs: tuple[str, ...] = ()
     viewers: tuple[Viewer, ...] = ()
     folded: bool = False
-    pictures_first: bool = False  # before the tables
+    pictures_first: bool = False  # before the tables, and before all but the first two paragraphs
     summary: Table | None = None  # its first table, which a report of many sections also begins with
 
 

@@ -22,7 +22,7 @@ document.querySelectorAll(".faders").forEach((faders) => {
   }));
 });
 /* On a narrow screen a picture is large in a box of its own that scrolls, by keys too, or fits the screen. */
-const narrow = matchMedia("(max-width: 49.9rem)");  // as in page.css
+const narrow = matchMedia("(max-width: 49.9rem)"); /* as in page.css */
 const reachable = (box) => {
   const title = box.closest("figure").querySelector("h3").textContent;
   const told = { tabindex: "0", role: "group", "aria-label": `${title} (scrolls sideways)` };

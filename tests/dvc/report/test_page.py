@@ -179,6 +179,17 @@ def test_a_reason_of_several_loads_is_told_once_with_their_names(tmp_path: Path)
     assert alike(("Load1: A.", "Load2: B.", "No load.")) == ("Load1: A.", "Load2: B.", "No load.")
 
 
+def test_a_picture_follows_the_first_two_sentences_of_the_answer(tmp_path: Path) -> None:
+    words, picture = ("One.", "Two.", "Three."), Picture("Strain", "", png())
+    table = Table("Numbers", ("load",), (("Load1",),))
+    first = Section("Answer", None, (table,), (picture,), words, pictures_first=True)
+    write_report(tmp_path / "r.html", "A heel", None, [first], (), {})
+    page = (tmp_path / "r.html").read_text()
+    places = [page.index(of) for of in ("<p>One.", "<p>Two.", "<figure>", "<p>Three.", "<h3>Numbers")]
+    assert places == sorted(places)
+    assert page.count("<p>Two.") == page.count("<p>Three.") == 1
+
+
 def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_path: Path) -> None:
     sections = [Section("Load1"), Section("Load1, cell by cell", folded=True)]
     write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {"command": "register"})
