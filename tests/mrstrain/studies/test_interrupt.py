@@ -79,8 +79,10 @@ def computed_s(processes: list[psutil.Process]) -> dict[int, float]:
 
 
 @pytest.mark.parametrize("group", [slow(False, id="process"), pytest.param(True, id="group")])
-def test_a_study_ends_and_goes_on(images, tmp_path, group):
-    study = tmp_path / "study"
+def test_a_study_ends_and_goes_on(images, tmp_path, group, monkeypatch):
+    study, temporary = tmp_path / "study", tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
     shutil.copytree(images, study)
     records = study / "results" / ".study"
     command = ["run", str(study), "--only", "register", "--workers", "1"]
@@ -90,6 +92,7 @@ def test_a_study_ends_and_goes_on(images, tmp_path, group):
     assert told["register repeat"] == "up to date"
     assert told["register Load1"] == "will run"
     assert "interrupted" in (study / "results" / "report.html").read_text().lower()
+    assert list(temporary.iterdir()) == []
 
 
 def test_a_study_whose_processes_hang_ends_and_leaves_nothing_in_shared_memory(images, tmp_path):
