@@ -206,7 +206,7 @@ def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     """
     try:
         refuse_path(path)
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as failure:
         raise InputError(f"{path}: the material sets cannot be read ({failure}).") from failure
     return _parsed(str(path), text)

@@ -84,7 +84,7 @@ def read_matrix(path: Path) -> FloatArray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty file is refused below
-            rows = np.loadtxt(path)
+            rows = np.loadtxt(path, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a matrix of four rows of four numbers ({error}).") from error
     return matrix_of(rows, str(path))
