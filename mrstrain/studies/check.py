@@ -16,7 +16,6 @@ from dvc.io.result_folder import REPEAT
 from dvc.labelling.boundaries import correctable
 from dvc.labelling.tissues import NAMES
 from dvc.measurement.subject import bones_of, is_bones_name
-from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
 from fe import (
     BONE,
@@ -34,6 +33,7 @@ from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.acquisition import AcquisitionOptions
 from mrstrain.options.credibility import CredibilityOptions
+from mrstrain.options.measurement import in_parallel
 from mrstrain.options.modelling import ModelReading
 from mrstrain.studies.costs import CARE, costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
@@ -101,7 +101,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         looked.at_report_details()
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
         if left:
-            looked.notes += costs(told, planned, left, *sizes_of(told), workers or usable_cores())
+            looked.notes += costs(told, planned, left, *sizes_of(told), in_parallel(workers))
             next_step = f"mrstrain run {study}"
         else:
             looked.notes.append("All stages are up to date; a run only rewrites the report.")
@@ -315,6 +315,10 @@ class _Look:
                     "unit."
                 )
         if study.mesh.file is None:
+            if reference is not None:
+                image_mm = float(np.multiply(reference.grid.shape, reference.grid.spacing_mm).max())
+                for plate in plates.values():
+                    self.tried(plate.check_gap, image_mm)
             self.at_tissues(reference, labels, chosen)
             return
         mesh = self.tried(mesh_given, study)

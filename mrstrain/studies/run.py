@@ -13,7 +13,7 @@ from dvc import Verdict
 from dvc.errors import InputError, ParameterError, few
 from dvc.io.result_folder import REPORT
 from dvc.memory import hand_memory_back
-from dvc.threads import usable_cores
+from mrstrain.options.measurement import in_parallel
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
@@ -137,7 +137,7 @@ def run_studies(
         )
     named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
     pipelines, to_do = _planned(named, only, force)
-    at_once, follower = workers or usable_cores(), follower or Follower()
+    at_once, follower = in_parallel(workers), follower or Follower()
     reports = {prefix: Report(study, pipelines[prefix], follower.on_report) for prefix, study in named.items()}
     expectations: dict[str, Expected] = {}
     watch = Watch(follower, reports, TimeLeft(expectations, at_once))
@@ -145,7 +145,7 @@ def run_studies(
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
 
-        return cluster(watch.told, [study.out for study in studies], scheduler=scheduler, workers=workers)
+        return cluster(watch.told, [study.out for study in studies], scheduler=scheduler, workers=at_once)
 
     logs: dict[str, Log] = {}
     needed: dict[int, list[float]] = defaultdict(list)  # bytes of the stages that write to each disk
