@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
 from numbers import Integral, Real
 from os import PathLike
-from pathlib import Path
 from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -71,8 +70,15 @@ def check(name: str, value: object, hint: Any) -> None:
     if (other := _misfit(name, value, hint)) is not None:
         named, given, wanted = other
         raise InputError(f"{named} must be {_words(wanted)}; got {shown(given)}.")
-    if "Path" in str(hint):
+    if _holds_paths(hint):
         _refuse_paths(value)
+
+
+def _holds_paths(hint: Any) -> bool:
+    """Whether a value of a type hint may be the path of a file, or hold some."""
+    hint = _meant(hint)
+    kind = get_origin(hint) or hint
+    return (isinstance(kind, type) and issubclass(kind, PathLike)) or any(map(_holds_paths, get_args(hint)))
 
 
 def _refuse_paths(value: object) -> None:
@@ -136,7 +142,7 @@ def _words(hint: Any) -> str:
     hint = _meant(hint)
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (UnionType, Union):
-        paths = {each for each in inner if PathLike in (each, get_origin(each)) or each is Path}
+        paths = {each for each in inner if _holds_paths(each)}
         others = [each for each in inner if each is not NoneType and not (paths and each in {*paths, str})]
         return ", or ".join(_words(each) for each in [*others, PathLike][: len(others) + bool(paths)])
     if origin is tuple and inner and Ellipsis not in inner:

@@ -1,6 +1,7 @@
 """JSON, TOML, CSV and npz files of our own, read whole: whatever is wrong with one is a ValueError.
 
-The libraries below raise a dozen kinds of error on a damaged file, and take some damage for numbers.
+The libraries below raise a dozen kinds of error on a damaged file, and take some damage for numbers. Editors on Windows
+put a byte order mark before a text in UTF-8 ("utf-8-sig"), which is left out.
 """
 
 import csv
@@ -23,7 +24,7 @@ def read_json(path: Path) -> dict[str, Any]:
     64 bits.
     """
     try:
-        return parse_json(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as wrong:
         raise ValueError(str(wrong)) from wrong  # whose repr would quote the whole file
 
@@ -65,7 +66,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     ValueError for a row with other than so many cells, for quotes that do not end, and for a table without a header.
     """
     try:
-        head, *rows = csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline=""), strict=True)
+        head, *rows = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
     except csv.Error as damage:
         raise ValueError(f"{path.name}: {damage}") from damage
     except UnicodeDecodeError as wrong:

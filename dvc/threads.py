@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from queue import SimpleQueue
 
 _PARTS = 4  # for each thread: what one part takes longer, another makes up for
+_MOST = 256  # threads, on any machine: elastix gives the same result only on as many threads as another machine had
 _on_one_core: list[None] = []  # blocks of `on_one_core`
 SMALL = 1 << 18
 """Numbers that one thread adds up before another is awake: a loop over fewer is not shared."""
@@ -21,6 +22,11 @@ def usable_cores() -> int:
     if _on_one_core:
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def most_threads() -> int:
+    """Number of threads above which a number is a mistake, and may take all of the memory."""
+    return max(_MOST, usable_cores())
 
 
 class _Loop:

@@ -25,6 +25,7 @@ from fe.linear import SingularError, Solver
 _BEYOND_MM = 0.5
 _SAME_MM = 1e-6  # nodes whose heights differ by less touch together, independent of rounding
 _LEAST_ARM_MM = 1e-3
+_UNITS = 1e3  # between mm and micrometres
 _ACCURACY = 1e-3  # of the linear solutions for a rotation
 
 
@@ -83,6 +84,15 @@ class Plate:
             if pivot.shape != (3,) or not np.isfinite(pivot).all():
                 raise InputError(f"The plate's pivot needs three finite coordinates in mm; got {self.pivot_mm}.")
         object.__setattr__(self, "axes", plate_axes(-frozen(self.normal, np.float64), self.shear))
+
+    def check_gap(self, body_mm: float) -> None:
+        """InputError if the plate begins further from the skin than the body is long, which is a wrong unit."""
+        if self.gap_mm > body_mm:
+            unit = " Is it in micrometres?" if self.gap_mm <= _UNITS * body_mm else ""
+            raise InputError(
+                f"The gap between plate and skin, gap_mm (--gap-mm), is {self.gap_mm:g} mm, larger than the body "
+                f"({body_mm:.3g} mm). Gaps are in mm.{unit}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -163,7 +163,7 @@ class Problem:
         If an argument has the wrong type, such as a file path in place of a mesh; if a region has no material, a cell
         has no region or is there twice, or a surface set is missing; if tissue is not connected to a fixed surface; if
         the plate comes from the wrong side; or if a load cannot be applied by the plate, passed on the way, or borne by
-        any tissue.
+        any tissue, or if the gap is larger than the body.
     """
 
     mesh: TetMesh
@@ -187,6 +187,7 @@ class Problem:
                     f"interface with bone, which is fixed, '{BONE}', and the surface that the plate touches '{SKIN}'."
                 )
         check_materials(mesh, self.materials)
+        self.plate.check_gap(float(np.ptp(mesh.points_mm, axis=0).max()))
         check_loads(self.plate, self.loads)
         _check_passed(self.plate, self.loads, self.passed)
         held = np.unique(np.concatenate([mesh.facets[name].ravel() for name in fixed]))

@@ -74,25 +74,37 @@ class MaterialSet:
         >>> materials["muscle"] is materials["fat"], notes
         (True, ('friedman has no material for muscle; that of fat is used.',))
         """
-        by_region, notes = dict[str, Material](), list[str]()
         if WHOLE in self.materials:
             by_region = dict.fromkeys(regions, self.materials[WHOLE])
             return by_region, tuple(doubts(self.name, self.materials))
-        known = {tissue.casefold(): law for tissue, law in self.materials.items()}
-        for region in regions:
-            tried = (region, *_INSTEAD.get(region.casefold(), ()))
-            name = next((t for t in tried if t.casefold() in known), None)
-            if name is None:
-                instead = f" (nor for {' or '.join(tried[1:])}, as a substitute)" if tried[1:] else ""
-                raise InputError(
-                    f"The material set {self.name} has no material for the region '{region}'{instead}; it has "
-                    f"{few(self.materials, most=3)}. Write your own set (.toml) with it, rename the region, or, "
-                    "if it is a bone, name it so when meshing."
-                )
-            by_region[region] = known[name.casefold()]
-            if name != region:
-                notes.append(f"{self.name} has no material for {region}; that of {name} is used.")
-        return by_region, (*notes, *doubts(self.name, by_region))
+        of = {tissue.casefold(): law for tissue, law in self.materials.items()}
+        by_region = {region: of[self._tissue_for(region).casefold()] for region in regions}
+        return by_region, (*self.substitutes(by_region), *doubts(self.name, by_region))
+
+    def substitutes(self, regions: Iterable[str]) -> tuple[str, ...]:
+        """A sentence for each region that gets the material of another tissue; errors as `for_regions`."""
+        if WHOLE in self.materials:
+            return ()
+        used = {region: self._tissue_for(region) for region in regions}
+        return tuple(
+            f"{self.name} has no material for {region}; that of {name} is used."
+            for region, name in used.items()
+            if name != region
+        )
+
+    def _tissue_for(self, region: str) -> str:
+        """The tissue whose material a region gets."""
+        known = {tissue.casefold() for tissue in self.materials}
+        tried = (region, *_INSTEAD.get(region.casefold(), ()))
+        name = next((t for t in tried if t.casefold() in known), None)
+        if name is None:
+            instead = f" (nor for {' or '.join(tried[1:])}, as a substitute)" if tried[1:] else ""
+            raise InputError(
+                f"The material set {self.name} has no material for the region '{region}'{instead}; it has "
+                f"{few(self.materials, most=3)}. Write your own set (.toml) with it, rename the region, or, "
+                "if it is a bone, name it so when meshing."
+            )
+        return name
 
 
 def doubts(name: str, materials: Materials) -> list[str]:
@@ -206,7 +218,7 @@ def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     """
     try:
         refuse_path(path)
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as failure:
         raise InputError(f"{path}: the material sets cannot be read ({failure}).") from failure
     return _parsed(str(path), text)

@@ -20,7 +20,7 @@ from .location import LEAST_ML, CellGraph, Overlap, StrainCluster, Threshold, ov
 from .mapping import ALL, Field, MappedFields, check_bones, filled_from_nearest, map_fields
 from .mavm import ModelForm, model_form, safety_factor, signed_areas
 from .measured_boundary import boundary_displacement, simulate_driven, write_boundary_conditions
-from .misfit import check_in_tissue, check_models, displacement_slip, misfits
+from .misfit import Misfit, check_in_tissue, check_models, displacement_slip, misfits
 from .ranking import ALL_LOADS, CohortRank, Ranking, rank_over_loads, rank_over_subjects
 from .sensitivity import SHARED, Variant
 from .tables import Curve
@@ -28,7 +28,7 @@ from .tables import Curve
 __all__ = [
     "ALL", "ALL_LOADS", "LEAST_ML", "LEVELLED", "NOTHING", "RANGE", "SHARED", "Agreement", "Area", "Band",
     "CellGraph", "CohortRank", "Comparison", "ComparisonError", "Criteria", "Curve", "Decomposition", "FeResult",
-    "Field", "GeometryError", "InputError", "LoadCase", "LoadComparison", "MappedFields", "ModelForm",
+    "Field", "GeometryError", "InputError", "LoadCase", "LoadComparison", "MappedFields", "Misfit", "ModelForm",
     "OutputError", "Overlap", "Ranking", "Reconstruction", "Representation", "SkinDisplacement", "StrainCluster",
     "Threshold", "TissueBasis", "Variant", "agreements", "area_between", "bands", "boundary_displacement",
     "check_bones", "check_in_tissue", "check_models", "check_overlap", "check_range", "compare", "compare_load",

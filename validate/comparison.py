@@ -39,7 +39,7 @@ from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison
 from validate.location import Overlap
 from validate.mapping import ALL
 from validate.mavm import ModelForm
-from validate.misfit import check_models, displacement_slip
+from validate.misfit import Misfit, check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import Drawn, area_rows, closing_sections, draw, drawings_of_all, load_sections, overview, shown
 from validate.tables import Curve
@@ -69,7 +69,7 @@ class Comparison:
     verdict, verdicts : Verdict or None, mapping of load to Verdict or None
         Verdict on the inputs (registrations, and input errors of the models; None if there is neither), and on each
         registration.
-    notes, warnings : tuple of str
+    notes, warnings : tuple of str, tuple of Misfit
         Limitations of this comparison, and possible input errors of the models.
     loads : tuple of LoadComparison
         Fields, by load; empty for a comparison that was read from files.
@@ -88,7 +88,7 @@ class Comparison:
     verdict: Verdict | None
     verdicts: Mapping[str, Verdict | None]
     notes: tuple[str, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Misfit, ...] = ()
     loads: tuple[LoadComparison, ...] = ()
     errors: tuple[ComparisonError, ...] = ()
 
@@ -271,7 +271,7 @@ def _write_load(
 def compare(
     cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *,
     mesh: TetMesh | None = None, criteria: Criteria | None = None, notes: Sequence[str] = (),
-    warnings: Sequence[str] | None = None, progress: Callable[[float], None] | None = None, each: Each = map,
+    warnings: Sequence[Misfit] | None = None, progress: Callable[[float], None] | None = None, each: Each = map,
 ) -> Comparison:  # fmt: skip
     """Compare models with a measurement of one or several loads.
 
@@ -288,7 +288,7 @@ def compare(
         Range of strains, thresholds, and seed of the draws.
     notes : sequence of str
         Further notes on the models.
-    warnings : sequence of str, optional
+    warnings : sequence of Misfit, optional
         Result of `check_models`; by default the models are checked here.
     progress : callable
         Called with the fraction done.
@@ -313,7 +313,8 @@ def compare(
     loads: list[LoadComparison] = []
     for one in each(partial(compare_load, labels=labels, bones=bones, mesh=mesh, criteria=by), cases):
         loads.append(replace(one, labels=labels))  # one label map for all; loads from other processes have copies
-        odd += [f"{one.load}: {slip}" for name in one.fields.models if (slip := displacement_slip(one.fields, name))]
+        slips = {name: displacement_slip(one.fields, name) for name in one.fields.models}
+        odd += [Misfit(one.load, name, f"{one.load}: {slip}") for name, slip in slips.items() if slip]
         if progress is not None:
             progress(len(loads) / len(cases))
     verdicts = {case.load: case.verdict for case in cases}
@@ -326,18 +327,18 @@ def compare(
         representations=tuple(r for one in loads for r in one.representations),
         model_forms=tuple(m for one in loads for m in one.model_forms),
         curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
-        ranking=rank_over_loads(loads), strains=by.strains, coverage_ml=coverage, verdict=verdict, verdicts=verdicts,
-        notes=(*notes, *_doubts(verdict), *_limitations(loads)), warnings=tuple(odd), loads=tuple(loads),
-        errors=tuple(error for one in loads for error in one.errors),
+        ranking=rank_over_loads(loads, odd), strains=by.strains, coverage_ml=coverage,
+        verdict=verdict, verdicts=verdicts, notes=(*notes, *_doubts(verdict), *_limitations(loads)),
+        warnings=tuple(odd), loads=tuple(loads), errors=tuple(error for one in loads for error in one.errors),
     )  # fmt: skip
 
 
-def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] = ()) -> Verdict | None:
+def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[Misfit] = ()) -> Verdict | None:
     """The verdict on the inputs: the worst of the registrations' (by load) and of warnings on models; None without any.
 
     It lists the reasons of all verdicts below Trust, the worst first.
     """
-    verdicts = [Verdict("caution", tuple(warnings))] if warnings else []
+    verdicts = [odd.verdict for odd in warnings]
     for load, verdict in measured.items():
         if verdict is not None:
             reasons = tuple(f"{load}, registration ({verdict.words}): {reason}" for reason in verdict.reasons)

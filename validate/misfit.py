@@ -1,6 +1,7 @@
 """Checks that a model lies in the imaged tissue; detects wrong units, frames and reference configurations."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations, product
 from pathlib import Path
@@ -8,11 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dvc import LabelMap, TetMesh
+from dvc import LabelMap, TetMesh, Verdict
 from dvc.arguments import checked
 from dvc.errors import GeometryError, InputError
 from dvc.file_names import clash
 from dvc.mesh import box_told, repeated_rows
+from dvc.trust.verdict import Level
 from dvc.worker import Each
 from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
@@ -20,15 +22,41 @@ from validate.mapping import MappedFields, check_bones, tissues_of
 
 _LEAST_OVERLAP, _GOOD_OVERLAP, _SAME_TISSUE, _VOLUME_CHANGE = 0.85, 0.95, 0.8, 0.15
 _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
+_FAR_MM = 50.0  # no plate that presses soft tissue moves the bone so far: a seat sinks into a buttock by 2 to 4 cm
 _ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 _SAME_PLACE_MM = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """A possible input error of a model.
+
+    Attributes
+    ----------
+    load, model : str
+        The load and the name of the model; no load from `misfits`.
+    told : str
+        A sentence on it.
+    level : {"caution", "distrust"}
+        Of the verdict on the inputs of a comparison that includes this model.
+    """
+
+    load: str
+    model: str
+    told: str
+    level: Level = "caution"
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the inputs, with the sentence as its reason."""
+        return Verdict(self.level, (self.told,))
 
 
 @checked
 def check_models(
     cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *, each: Each = map
-) -> list[str]:
-    """Check that every model lies in the imaged tissue; returns a sentence for each possible input error.
+) -> list[Misfit]:
+    """Check that every model lies in the imaged tissue; returns each possible input error.
 
     With ``each`` from `dvc.worker.side_by_side`, several loads are checked at the same time.
 
@@ -48,16 +76,18 @@ def check_models(
     return [odd for of in each(partial(_odd_models, labels=labels, bones=bones), cases) for odd in of]
 
 
-def _odd_models(case: LoadCase, labels: LabelMap, bones: Sequence[str]) -> list[str]:
+def _odd_models(case: LoadCase, labels: LabelMap, bones: Sequence[str]) -> list[Misfit]:
     """Possible input errors of the models of one load."""
-    warnings, bone = [], _points_of_bone(labels, bones)
+    found, bone = list[Misfit](), _points_of_bone(labels, bones)
     for result in case.fields()[1]:
         check_overlap(result.path, result.mesh, labels.grid)
         if result.rigid_parts:
             parts = ", ".join(result.rigid_parts)
-            warnings.append(f"{case.load}: {result.name} has rigid parts, which are not compared: {parts}.")
-        warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones, bone)]
-    return warnings
+            told = f"{case.load}: {result.name} has rigid parts, which are not compared: {parts}."
+            found.append(Misfit(case.load, result.name, told))
+        odd = misfits(result, labels, bones, bone)
+        found += [replace(one, load=case.load, told=f"{case.load}: {one.told}") for one in odd]
+    return found
 
 
 def _points_of_bone(labels: LabelMap, bones: Sequence[str]) -> cKDTree:
@@ -88,15 +118,15 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
     return overlap
 
 
-def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDTree | None = None) -> list[str]:
-    """Check a model against the label map; returns a sentence for each possible input error.
+def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDTree | None = None) -> list[Misfit]:
+    """Check a model against the label map; returns each possible input error.
 
     Reported are models with cells that are there twice, of which less than 95 % lies in the labelled soft tissue, whose
-    tissue names agree with the label map in under 80 % of the volume, that move by over 1 mm at the bone, or whose mean
-    change of cell volume is over 15 %. Errors as `check_in_tissue`. ``bone`` has the points of the bones' voxels, LPS
-    mm, if they are known already.
+    tissue names agree with the label map in under 80 % of the volume, that move by over 1 mm at the bone (by over
+    50 mm: "Do not trust"), or whose mean change of cell volume is over 15 %. Errors as `check_in_tissue`. ``bone`` has
+    the points of the bones' voxels, LPS mm, if they are known already.
     """
-    mesh, warnings = result.mesh, []
+    mesh, warnings, wrong = result.mesh, list[str](), list[str]()
     if len(again := repeated_rows(np.round(mesh.centroids_mm / _SAME_PLACE_MM))):
         warnings.append(
             f"{len(again)} of its {len(mesh.cells)} tetrahedra are repeated (the first is number {again[0]}, from 0), "
@@ -117,7 +147,13 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
     of_bone = bone or _points_of_bone(labels, bones)
     distance = of_bone.query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0]
     moved = np.linalg.norm(result.deformation.u_mm[distance < _NEAR_BONE_MM], axis=1)
-    if len(moved) and np.median(moved) > _RIGID_MM:
+    if len(moved) and np.median(moved) > _FAR_MM:
+        wrong.append(
+            f"the model moves by {np.median(moved):.0f} mm at the bone (limit: 'Do not trust' above {_FAR_MM:g} mm), "
+            "farther than a load moves it. Check the unit and frame of the displacements, and that they are in the "
+            "order of the nodes."
+        )
+    elif len(moved) and np.median(moved) > _RIGID_MM:
         warnings.append(
             f"the model moves by {np.median(moved):.1f} mm at the bone, but the measurement is relative to the bone; "
             "remove the rigid motion of the bone from the model."
@@ -129,7 +165,8 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
             f"the mean change of cell volume is {change:.0%}, which is implausible for soft tissue; check that "
             "displacements have the frame and unit of the coordinates, which must be unloaded."
         )
-    return [f"{result.name}: {warning}" for warning in warnings]
+    levels: dict[Level, list[str]] = {"distrust": wrong, "caution": warnings}
+    return [Misfit("", result.name, f"{result.name}: {told}", level) for level, of in levels.items() for told in of]
 
 
 def displacement_slip(fields: MappedFields, name: str) -> str:

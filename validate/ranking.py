@@ -14,6 +14,7 @@ from validate.curves import Area, Band
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, LoadComparison
 from validate.mapping import ALL
+from validate.misfit import Misfit
 
 Pairs = tuple[tuple[str, str], ...]
 """Of models, each in the order of their areas."""
@@ -53,11 +54,12 @@ class Ranking:
         return rank - sum(b == model for _, b in pairs), rank + sum(a == model for a, _ in pairs)
 
 
-def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
+def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ()) -> Ranking:
     """Sum the areas over loads, and rank the models.
 
     Errors of the measurements of different loads are assumed to be independent; wrong inputs of a model are shared by
-    all loads. The normalised area is the mean over loads. Statements name loads whose verdict is Do not trust.
+    all loads. The normalised area is the mean over loads. Statements name loads whose verdict is Do not trust, and so
+    models that have a misfit among ``odd`` of that verdict.
     """
     everywhere = [name for name in loads[0].fields.models if all(name in one.fields.models for one in loads)]
     band = summed([one.bands.get(ALL) for one in loads], [*everywhere, NOTHING])
@@ -76,11 +78,11 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     pairs = {ALL_LOADS: _pairs(ranked, informative)}
     pairs |= {one.load: _pairs(one.ranked(), None if one.hardly_strained else one.bands.get(ALL)) for one in loads}
     many = len(loads) > 1 and bool(ranked) and informative is not None
-    statements = [_under(one, pairs[one.load], many) for one in sorted(loads, key=lambda one: one.hardly_strained)]
+    statements = [_under(one, pairs[one.load], odd, many) for one in sorted(loads, key=lambda one: one.hardly_strained)]
     if many:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
         caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
-        caveat *= bool(distrusted)
+        caveat = caveat * bool(distrusted) + _not_trusted(odd)
         statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat, brief=False))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs, tuple(uninformative))
 
@@ -115,7 +117,13 @@ def _pairs(ranked: Sequence[Area], band: Band | None) -> Pairs:
     return tuple((a, b) for a, b in pairs if band is None or not (band.surely_below(a, b) or band.surely_below(b, a)))
 
 
-def _under(one: LoadComparison, pairs: Pairs, brief: bool) -> str:
+def _not_trusted(odd: Iterable[Misfit]) -> str:
+    """A sentence with the models that are not to be trusted; empty without any."""
+    names = dict.fromkeys(one.model for one in odd if one.level == "distrust")
+    return f" The verdict on {', '.join(names)} is Do not trust." if names else ""
+
+
+def _under(one: LoadComparison, pairs: Pairs, odd: Sequence[Misfit], brief: bool) -> str:
     """The statement on one load; empty if the uncertainty is unknown."""
     if one.hardly_strained:
         low = one.criteria.strains[0]
@@ -123,6 +131,7 @@ def _under(one: LoadComparison, pairs: Pairs, brief: bool) -> str:
         return f"{one.load}: {few}, so the area metric is not informative."
     distrusted = bool(one.case.verdict and one.case.verdict.level == "distrust")
     caveat = " The registration of this load has the verdict Do not trust." * distrusted
+    caveat += _not_trusted(each for each in odd if each.load == one.load)
     known = ALL in one.bands
     return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat, brief=brief) if known else ""
 

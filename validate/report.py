@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import Deformation, LabelMap, Mask, StrainField, Verdict, evaluate_on_grid
+from dvc import Deformation, LabelMap, Mask, StrainField, evaluate_on_grid
 from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
 from dvc.report.alike import alike
 from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from dvc.report.strips import MEASURED, Strip, strain_by_load
+from dvc.trust.verdict import together
 from validate import figures, standards
 from validate.agreement import Agreement, SkinDisplacement
 from validate.comparison_error import validation_section
@@ -21,6 +22,7 @@ from validate.fe_result import FeResult
 from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
+from validate.misfit import Misfit
 from validate.ranking import ALL_LOADS, Ranking, no_nearer
 from validate.strip import strip_of
 from validate.tables import Curve
@@ -180,11 +182,11 @@ def drawings_of_all(
 
 
 def overview(
-    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[str], notes: Sequence[str],
+    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[Misfit], notes: Sequence[str],
     pictures: Sequence[Picture],
 ) -> Section:  # fmt: skip
     """The first part of the report: best match, figures, areas, and ``warnings`` about models."""
-    slips = Verdict("caution", tuple(warnings)) if warnings else None
+    slips = together(odd.verdict for odd in warnings) if warnings else None
     areas = (_areas(loads, ranking),)
     return Section(
         "Models and loads", slips, areas, tuple(pictures), (*alike(ranking.statements), *notes), pictures_first=True

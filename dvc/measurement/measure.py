@@ -89,7 +89,8 @@ def measure(
     if labels is not None and not labels.grid.same_as(reference.grid):
         raise GeometryError("The labels are on another grid than the unloaded image; resample them with `fit_mask`.")
     normal, axes = plate_directions(plate_normal, shear_direction)
-    subject = Subject(reference, bone, tissue, labels, mesh, normal, axes)
+    pressed = plate_normal is not None or axes is not None
+    subject = Subject(reference, bone, tissue, labels, mesh, normal, axes, pressed=pressed)
     chosen = settings or Settings(GaussNewton() if labels is None else GaussNewtonWithInterfaces())
     body, floor = subject.body(), None
     with nullcontext(worker) if worker is not None else Worker(chosen.threads) as runner:

@@ -147,7 +147,7 @@ class Measurement:
         (relative, motion), body = without_motion(whole, subject.bone), subject.body()
         maps = strain_maps(relative, body)
         alignment = {"on": "none" if subject.bone is None else "bone", **judgement.motion_as_dict(motion)}
-        quality = assess(maps, body, subject.bone, plate_axes=subject.axes)
+        quality = assess(maps, body, subject.bone, plate_normal=subject.pressed_along)
         bars, source = ErrorBars(None, ""), Source(subject, body)
         regions, at = tuple(region_statistics(subject.regions(body), maps.by_quantity)), subject.lowest_bone_point_mm
         return cls(name, relative, maps, alignment, quality, regions, bars, subject.reference, source, at)

@@ -14,7 +14,7 @@ from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
 from dvc.report.drawing import Columns, Drawing
-from dvc.report.page import Cell, Table, shown
+from dvc.report.page import Cell, Estimate, Table
 from dvc.report.sheet import View
 from dvc.trust.components import ComponentUncertainty
 from dvc.trust.quality import NoiseFloor, Quality
@@ -156,20 +156,14 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
 
 
 def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
-    """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known.
+    """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known."""
+    known = {(i.region, i.statistic): (i.low, i.high) for i in intervals}
 
-    All to three decimals, as in the summary of the command: the eye then compares them down a column.
-    """
+    def cells(r: RegionRow) -> tuple[Cell, ...]:
+        median, high = (known.get((r.region, figure)) for figure in ("median", "p95"))
+        return r.region, Estimate(r.median, median), Estimate(r.p95, high)
 
-    def told(strain: float) -> str:
-        return f"{strain:z.3f}" if np.isfinite(strain) else shown(strain)
-
-    known = {(i.region, i.statistic): f" ({told(i.low)} to {told(i.high)})" for i in intervals}
-    rows = tuple(
-        (r.region, *(told(getattr(r, figure)) + known.get((r.region, figure), "") for figure in ("median", "p95")))
-        for r in regions
-        if r.quantity == "max_shear"
-    )
+    rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     note = "In brackets: interval of 95 % coverage, from the error model." if known else ""
     return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 

@@ -78,6 +78,8 @@ class Subject:
         Role to the file it came from, for provenance; empty where arrays were given.
     from_image : LabelsFromImage or None
         How the labels came out if they were made from the image; None for others.
+    pressed : bool
+        Whether a plate is known to press against ``plate_normal``; otherwise only slices and figures follow it.
     """
 
     reference: Image
@@ -89,6 +91,12 @@ class Subject:
     axes: FloatArray | None = None
     files: dict[str, Path] = field(default_factory=dict)
     from_image: LabelsFromImage | None = None
+    pressed: bool = False
+
+    @property
+    def pressed_along(self) -> FloatArray | None:
+        """The plate's outward normal if a plate is known to press; None otherwise."""
+        return self.plate_normal if self.pressed else None
 
     @property
     def lowest_bone_point_mm(self) -> FloatArray | None:

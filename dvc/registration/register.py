@@ -31,6 +31,7 @@ from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refus
 from dvc.registration.bone_mask import mask_doubt
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
 from dvc.registration.engines import DEFAULT, engine_named
+from dvc.threads import most_threads, usable_cores
 from dvc.worker import Worker
 
 _log = logging.getLogger("dvc.registration")
@@ -60,7 +61,7 @@ class Settings:
     Raises
     ------
     ParameterError
-        For an engine by its name (see `Settings.of`), another alignment, or less than one thread.
+        For an engine by its name (see `Settings.of`), another alignment, less than one thread, or far too many.
     """
 
     engine: Engine = field(default_factory=lambda: engine_named(DEFAULT))
@@ -74,8 +75,10 @@ class Settings:
         check("threads", self.threads, int)
         if self.align_on not in get_args(AlignOn):
             raise ParameterError(f"`align_on` must be {' or '.join(get_args(AlignOn))}; got {self.align_on!r}.")
-        if self.threads < 1:
-            raise ParameterError(f"`threads` must be 1 or more; got {self.threads}.")
+        if not 1 <= self.threads <= most_threads():
+            raise ParameterError(
+                f"`threads` must be 1 to {most_threads()}; got {self.threads}. This machine has {usable_cores()} cores."
+            )
 
     def of_repeat(self) -> Self:
         """The settings for a repeat scan, which must not be smoothed more than a loaded image."""

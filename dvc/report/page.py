@@ -22,8 +22,6 @@ from dvc.report.html import packed, policy, stored, template, unbroken, wrapping
 from dvc.threads import usable_cores
 from dvc.trust.verdict import Level, Verdict
 
-Cell = str | float | int | None
-
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
 
@@ -91,6 +89,33 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
+class Estimate:
+    """A measured value and its interval of 95 % coverage, if that is known, all shown to three decimals.
+
+    The eye then compares them down a column.
+
+    >>> print(Estimate(0.4204), Estimate(0.131, (0.0301, 0.1391)), Estimate(float("nan")), sep=", ")
+    0.420, 0.131 (0.030 to 0.139), –
+    """
+
+    value: float
+    interval: tuple[float, float] | None = None
+
+    @property
+    def least(self) -> float:
+        """Lower end of the interval; the value where that is not known."""
+        low = self.value if self.interval is None else self.interval[0]
+        return low if np.isfinite(low) else self.value
+
+    def __str__(self) -> str:
+        value, *ends = (f"{n:z.3f}" if np.isfinite(n) else shown(n) for n in (self.value, *(self.interval or ())))
+        return f"{value} ({' to '.join(ends)})" if ends else value
+
+
+Cell = str | float | int | None | Estimate
+
+
+@dataclass(frozen=True, slots=True)
 class Table:
     """Rows under named columns, one cell for each; numbers are shown to three digits, missing ones as a dash.
 
@@ -113,7 +138,7 @@ class Table:
     def numeric(self) -> tuple[bool, ...]:
         """Whether each column holds numbers and missing values alone, and is set flush right."""
         columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.columns)
-        return tuple(bool(column) and not any(isinstance(c, str) for c in column) for column in columns)
+        return tuple(bool(column) and not any(isinstance(c, str | Estimate) for c in column) for column in columns)
 
     @property
     def texts(self) -> list[tuple[str, ...]]:

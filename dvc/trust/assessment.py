@@ -77,7 +77,7 @@ def assess(
     landmark_errors_mm: FloatArray | None = None,
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
-    plate_axes: FloatArray | None = None,
+    plate_normal: FloatArray | None = None,
 ) -> Quality:
     """Assess a registration by its strain maps, the similarity of the images, and further evidence.
 
@@ -99,8 +99,8 @@ def assess(
     in_bone : (mm, no unit), optional
         For maps with a rigid bone: root mean square displacement and 95th percentile of the maximum shear strain in the
         bone before it was made rigid.
-    plate_axes : (3, 3), optional
-        Of a plate that presses on the tissue, LPS (`dvc.plate_axes`): the tissue between it and the bone must move
+    plate_normal : (3,), optional
+        Unit direction, LPS, from the body to a plate that presses on it: the tissue between it and the bone must move
         towards the bone.
 
     Returns
@@ -144,8 +144,8 @@ def assess(
     findings += _judged("landmark_error_mm", quality.landmarks["median_mm"])
     if floor is not None:
         findings += _judged("floor_shear_p95", floor.max_shear_p95)
-    if bone is not None and plate_axes is not None:
-        findings += moves_away(displacement_along_normal(maps, tissue, bone, plate_axes))
+    if bone is not None and plate_normal is not None:
+        findings += moves_away(displacement_along_normal(maps, tissue, bone, plate_normal))
     return replace(quality, verdict=together(findings))
 
 

@@ -1,6 +1,7 @@
 """Does the tissue between the bone and the plate move as under a plate: towards the bone?"""
 
 import numpy as np
+from scipy.linalg import null_space
 
 from dvc.arrays import FloatArray
 from dvc.deformation.strain_maps import StrainMaps
@@ -11,7 +12,7 @@ _CELL_MM, _LAYER_MM = 3.0, 3.0
 _MOST_MM = 0.5
 
 
-def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, axes: FloatArray) -> float:
+def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, normal: FloatArray) -> float:
     """Mean displacement along the plate's outward normal of the tissue nearest the plate, in the shadow of the bone.
 
     Parameters
@@ -20,14 +21,15 @@ def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, axes: 
         Displacement relative to the bone, reference configuration, LPS mm.
     tissue, bone : Mask
         On the grid of the maps. Only tissue within 3 mm of its outer surface counts, where the bone lies behind it.
-    axes : (3, 3)
-        Columns: plate normal, away from the body, and two directions in the plate, LPS; see `dvc.plate_axes`.
+    normal : (3,)
+        Unit direction from the body to the plate, LPS.
 
     Returns
     -------
     float
         mm; negative where the tissue is compressed against the bone, NaN if there is no such tissue.
     """
+    axes = np.column_stack([normal, null_space(normal[None])])  # with two directions in the plate
     spacing = maps.grid.spacing_mm
     sparse = tuple(slice(None, None, max(1, int(2.0 / step))) for step in spacing)
     cell_mm = max(_CELL_MM, 1.5 * float(spacing.max()))

@@ -120,7 +120,7 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow], verdict: Verdict | 
 def read_regions_csv(path: Path) -> list[RegionRow]:
     """Read what `write_regions_csv` wrote; InputError for a missing file or another table."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             return [_row_of(cells) for cells in csv.DictReader(file)]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as failure:
         why = f"{type(failure).__name__}: {failure}"

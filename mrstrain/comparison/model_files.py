@@ -249,7 +249,7 @@ def _settings(place: Path) -> dict[str, Any]:
     if not settings.is_file():
         return {}
     try:
-        text = settings.read_text(encoding="utf-8")
+        text = settings.read_text(encoding="utf-8-sig")
         content = parse_toml(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{settings} is not a valid TOML file ({error}).") from error

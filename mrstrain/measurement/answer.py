@@ -1,15 +1,16 @@
 """The first part of a report on measurements: the strain of every load in one slice, and by tissue in a table."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
 
 from dvc import Subject
 from dvc.errors import InputError
 from dvc.io.result_folder import QUALITY
 from dvc.measurement.subject import is_bones_name
-from dvc.report.page import Section, Table
+from dvc.report.page import Estimate, Section, Table
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
@@ -62,24 +63,20 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     It is the one with the largest 95th percentile of those whose interval begins within 10 % of the highest beginning:
     a tissue of few voxels may have a larger percentile by chance.
     """
-    known = [(_numbers(row[3]), row) for row in table.rows if _numbers(row[3])] if table is not None else []
+    rows = () if table is None else table.rows
+    known = [(high, row) for row in rows if isinstance(high := row[3], Estimate) and np.isfinite(high.value)]
     if not known:
         return ()
-    begins = [numbers[:2][-1] for numbers, _ in known]  # of the interval; or the value, without one
-    likely = [one for one, begin in zip(known, begins, strict=True) if begin >= _NEARLY * max(begins)]
-    _, (load, tissue, median, high, *_) = max(likely, key=lambda one: one[0][0])
+    least = _NEARLY * max(high.least for high, _ in known)
+    likely = [one for one in known if one[0].least >= least]
+    high, (load, tissue, median, *_) = max(likely, key=lambda one: one[0].value)
     force = f" ({beside.forces[str(load)]})" if str(load) in beside.forces else ""
     told = f"The most strained tissue is {tissue} under {load}{force}: measured maximum shear strain {median} in the "
     told += f"median and {high} at the 95th percentile"
-    told += ", with 95 % intervals in brackets." if "(" in str(high) else "."
+    told += "." if high.interval is None else ", with 95 % intervals in brackets."
     if beside.floor is not None:
         told += f" The noise floor is {beside.floor.max_shear_p50:.3f} and {beside.floor.max_shear_p95:.3f}."
     return (told,)
-
-
-def _numbers(cell: object) -> list[float]:
-    """Numbers of a cell of `table_of_loads`: the value, and the ends of its interval if there is one."""
-    return [float(number) for number in re.findall(r"\d+\.?\d*", str(cell))]
 
 
 def table_of_loads(measured: Sequence[Section]) -> Table | None:

@@ -20,7 +20,7 @@ from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.options.door import door
-from mrstrain.options.measurement import Cores
+from mrstrain.options.measurement import Cores, in_parallel
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
 from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
@@ -113,7 +113,7 @@ def simulate(
     beside = [names] if (names := place.with_suffix(".json")).is_file() else []
     files = {"mesh": [place, *beside], "sets": [Path(s) for s in sets if s.endswith(".toml")]}
     given = coordinates.plain() | contact | {"fixed": list(held), "limit_s": limit_s, "mesh_made": _mesh_made(place)}
-    at_once = max(1, min(cores.workers or usable_cores(), len(jobs)))
+    at_once = max(1, min(in_parallel(cores.workers), len(jobs)))
     each = cores.threads or max(1, usable_cores() // at_once)
     options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
     run = _Run(target, loads, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)

@@ -72,7 +72,7 @@ def variant_folders(places: Iterable[Path]) -> list[VariantFolder]:
 
 def _read(file: Path) -> VariantRecord:
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
         content = parse_toml(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a valid TOML file ({error}).") from error

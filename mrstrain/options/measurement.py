@@ -1,12 +1,13 @@
 """Options of measuring: the subject, the registration, and where results are wanted."""
 
+import logging
 import shlex
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator
 
-from dvc.threads import usable_cores
+from dvc.threads import most_threads, usable_cores
 from mrstrain.options.model import Cli, Count, Flag, NotNegative, Options, Positive, Vector
 
 AUTO = Path("auto")
@@ -17,6 +18,25 @@ IMAGE, LABELS = "{image}", "{labels}"
 """Places of the unloaded image and of the label map in a command that segments."""
 Frame = Literal["LPS", "RAS"]
 Unit = Literal["mm", "m"]
+_log = logging.getLogger("mrstrain.options")
+
+
+def _bearable(threads: int) -> int:
+    if threads > (most := most_threads()):
+        raise ValueError(f"must be {most} or less (cores of this machine: {usable_cores()})")
+    return threads
+
+
+ThreadCount = Annotated[Count, AfterValidator(_bearable)]
+
+
+def in_parallel(workers: int | None) -> int:
+    """How many jobs run in parallel: as many as there are cores, or fewer where so many ``workers`` are asked for."""
+    cores = usable_cores()
+    if workers is not None and workers > cores:
+        told = "workers=%d: this machine has %d cores, so at most as many jobs run in parallel."
+        _log.warning(told, workers, cores)
+    return min(workers or cores, cores)
 
 
 def command_parts(command: str) -> list[str]:
@@ -211,14 +231,14 @@ class Threads(Options):
 
     panel: ClassVar[str] = "Advanced"
 
-    threads: Count | None = None
+    threads: ThreadCount | None = None
     """Number of threads. Default: all cores."""
 
 
 class Cores(Threads):
     """Number of threads, and of loads at the same time."""
 
-    threads: Count | None = None
+    threads: ThreadCount | None = None
     """Threads per worker. Default: the cores, divided among the loads computed in parallel."""
     workers: Count | None = None
     """Number of loads computed in parallel. Default: as many as cores and loads allow."""
@@ -227,7 +247,7 @@ class Cores(Threads):
 class Seeded(Threads):
     """Number of threads, and the seed of random numbers."""
 
-    threads: Count | None = None
+    threads: ThreadCount | None = None
     """Number of threads. Default: all cores. elastix reproduces its results only with the same number of threads."""
     seed: Count = 1
     """Seed of all random numbers."""
@@ -236,12 +256,11 @@ class Seeded(Threads):
 class Running(Seeded, Cores):
     """Number of threads, loads at the same time, and the seed of random numbers."""
 
-    threads: Count | None = None
+    threads: ThreadCount | None = None
     """Threads per worker. Default: the cores, divided among the loads computed in parallel. elastix reproduces its
     results only with the same number of threads."""
 
     def shares(self, loads: int) -> tuple[int, int]:
         """How many of the loads are registered at the same time, and the threads of each."""
-        cores = usable_cores()
-        at_once = min(self.workers or cores, cores, loads)
-        return at_once, self.threads or max(1, cores // at_once)
+        at_once = min(in_parallel(self.workers), loads)
+        return at_once, self.threads or max(1, usable_cores() // at_once)

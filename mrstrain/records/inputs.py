@@ -57,7 +57,8 @@ def read_subject(
     normal, axes = plate_directions(onto.plate_normal, onto.shear_direction)
     given = {role: paths[0] for role, paths in {"load0": [Path(load0)], **files.files, **onto.files}.items()}
     made = None if files.labels is None else made_from_image(files.labels)
-    return Subject(reference, bone, tissue, label_map, mesh, normal, axes, given, made)
+    pressed = onto.plate_normal is not None or axes is not None
+    return Subject(reference, bone, tissue, label_map, mesh, normal, axes, given, made, pressed)
 
 
 def made_labels(out: Path) -> tuple[Path, Path]:
@@ -84,7 +85,7 @@ def read_matrix(path: Path) -> FloatArray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty file is refused below
-            rows = np.loadtxt(path)
+            rows = np.loadtxt(path, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a matrix of four rows of four numbers ({error}).") from error
     return matrix_of(rows, str(path))

@@ -16,14 +16,12 @@ from dvc.io.result_folder import REPEAT
 from dvc.labelling.boundaries import correctable
 from dvc.labelling.tissues import NAMES
 from dvc.measurement.subject import bones_of, is_bones_name
-from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
 from fe import (
     BONE,
     Material,
     MaterialSet,
     Plate,
-    Problem,
     check_loads,
     check_meshing,
     fixed_facets,
@@ -34,8 +32,9 @@ from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.acquisition import AcquisitionOptions
 from mrstrain.options.credibility import CredibilityOptions
+from mrstrain.options.measurement import in_parallel
 from mrstrain.options.modelling import ModelReading
-from mrstrain.studies.costs import CARE, costs, mesh_given, sizes_of
+from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
@@ -47,29 +46,27 @@ _THERE = 0.5  # smallest fraction of the labelled tissue that must lie in the im
 _MOST_N = 3000.0  # of a load
 
 
-def _notes(problem: Problem) -> tuple[str, ...]:
-    return problem.notes
-
-
 _P = ParamSpec("_P")
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Result of `check`: all problems that prevent the study from being run, notes, and the next step without any."""
+    """Result of `check`: problems that prevent the study from being run, warnings, notes, and the next step."""
 
     wrong: tuple[str, ...]
+    warnings: tuple[str, ...]
     notes: tuple[str, ...]
-    next_step: str = ""
+    next_step: str = ""  # without a problem
 
     def summary(self) -> list[str]:
         """Summary, a few lines."""
-        return [*self.notes, *([f"ERROR: {one}" for one in self.wrong] or [self._passed])]
+        errors = [f"ERROR: {one}" for one in self.wrong]
+        return [*self.notes, *(f"WARNING: {one}" for one in self.warnings), *(errors or [self._passed])]
 
     @property
     def _passed(self) -> str:
         """The last line where nothing is wrong."""
-        count = sum(note.startswith(CARE) for note in self.notes)
+        count = len(self.warnings)
         warnings = f", but {count} warning{'s' if count > 1 else ''} above" if count else ""
         return f"No problems found{warnings}." + (f" Next step: {self.next_step}" if self.next_step else "")
 
@@ -101,11 +98,13 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         looked.at_report_details()
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
         if left:
-            looked.notes += costs(told, planned, left, *sizes_of(told), workers or usable_cores())
+            lines, warnings = costs(told, planned, left, *sizes_of(told), in_parallel(workers))
+            looked.notes += lines
+            looked.warnings += warnings
             next_step = f"mrstrain run {study}"
         else:
             looked.notes.append("All stages are up to date; a run only rewrites the report.")
-    return Checked(tuple(looked.wrong), tuple(looked.notes), next_step)
+    return Checked(tuple(looked.wrong), tuple(looked.warnings), tuple(looked.notes), next_step)
 
 
 def wrong_with(study: Study, stages: Sequence[Stage]) -> tuple[str, ...]:
@@ -122,6 +121,7 @@ class _Look:
     study: Study
     stages: Sequence[Stage] | None
     wrong: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     on_grid: dict[str, list[str]] = field(default_factory=dict)  # names of images, by their grid in words
 
@@ -212,7 +212,7 @@ class _Look:
         there = self.tried_at("images", "correct_labels", correctable, labels)
         for part, name, other in zip(there or (), ("like a bone", "skin"), ("skin", "bones"), strict=False):
             if not part.any():
-                self.notes.append(f"WARNING: no label is named {name}, so correct_labels corrects only {other}.")
+                self.warnings.append(f"no label is named {name}, so correct_labels corrects only {other}.")
 
     def at_marks(self, reference: Image | None) -> None:
         """Check the marks for the label map, among which the bone must be if there is no mask of it."""
@@ -279,9 +279,8 @@ class _Look:
             self.tried(check_meshing, labels, how.edge_mm, bones, how.finer)
         else:
             self.wrong.append(f"{self.study.at('mesh', 'bones')}: {labels.no_region(BONE)}")
-        self.notes += [
-            f"WARNING: {name} will be meshed as soft tissue, but has the name of a bone. If it is one, add it to "
-            "[mesh] bones."
+        self.warnings += [
+            f"{name} will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] bones."
             for name in self.soft(labels)
             if is_bones_name(name)
         ]
@@ -310,11 +309,14 @@ class _Look:
             self.tried(check_loads, plates[step.name], [step])
             if step.normal_n is not None and step.normal_n > _MOST_N:
                 at = study.at(f"loads.{step.name}", "normal_n")
-                self.notes.append(
-                    f"WARNING: {at}: a force of {step.normal_n:g} N is several times the weight of a person; check its "
-                    "unit."
+                self.warnings.append(
+                    f"{at}: a force of {step.normal_n:g} N is several times the weight of a person; check its unit."
                 )
         if study.mesh.file is None:
+            if reference is not None:
+                image_mm = float(np.multiply(reference.grid.shape, reference.grid.spacing_mm).max())
+                for plate in plates.values():
+                    self.tried(plate.check_gap, image_mm)
             self.at_tissues(reference, labels, chosen)
             return
         mesh = self.tried(mesh_given, study)
@@ -327,8 +329,8 @@ class _Look:
             laws = self.laws_of(one, mesh.regions)
             if laws is not None and pressed:
                 problems = self.tried(problems_of, mesh, laws, plates, pressed, held, study.models.element) or []
-                odd = [f"WARNING: {note}" for each in problems for note in self.tried(_notes, each) or ()]
-                self.notes += [note for note in dict.fromkeys(odd) if note not in self.notes]
+                odd = dict.fromkeys(note for each in problems for note in each.notes)
+                self.warnings += [note for note in odd if note not in self.warnings]
 
     def laws_of(self, one: MaterialSet, regions: Iterable[str]) -> Mapping[str, Material] | None:
         """The materials of a set by region, with warnings about odd ones."""
@@ -336,7 +338,9 @@ class _Look:
         if found is None:
             return None
         laws, told = found
-        self.notes += [note if note.endswith(" is used.") else f"WARNING: {note}" for note in told]
+        substitutes = one.substitutes(laws)
+        self.notes += substitutes
+        self.warnings += told[len(substitutes) :]
         return laws
 
     def at_tissues(self, reference: Image | None, labels: LabelMap | None, sets: Sequence[MaterialSet]) -> None:

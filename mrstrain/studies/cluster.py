@@ -1,8 +1,10 @@
 """The Dask cluster on which stages run: the cores of this machine by default, or an existing cluster."""
 
 import logging
+import os
 import queue
 import signal
+import tempfile
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
@@ -272,23 +274,39 @@ def cluster(
 
 @contextmanager
 def _of_this_machine(workers: int) -> Iterator[tuple[LocalCluster, Client]]:
-    """A cluster of processes of this machine, ended with the block however that ends."""
-    local = LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=True, silence_logs=_NOTHING_LOGGED, memory_limit=0,
-        host="127.0.0.1", dashboard_address="127.0.0.1:0",
-    )  # fmt: skip
-    try:
-        with Client(local) as client:
-            try:
-                yield local, client
-            except BaseException:
-                _kill_workers(local)
-                raise
-    finally:
+    """A cluster of processes of this machine, ended with the block however that ends, with their temporary files."""
+    with _temporary_files():
+        local = LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, silence_logs=_NOTHING_LOGGED, memory_limit=0,
+            host="127.0.0.1", dashboard_address="127.0.0.1:0",
+        )  # fmt: skip
         try:
-            local.close()
-        except TimeoutError:  # a worker that lacks memory may not end when it is asked to
-            _kill_workers(local)
+            with Client(local) as client:
+                try:
+                    yield local, client
+                except BaseException:
+                    _kill_workers(local)
+                    raise
+        finally:
+            try:
+                local.close()
+            except TimeoutError:  # a worker that lacks memory may not end when it is asked to
+                _kill_workers(local)
+
+
+@contextmanager
+def _temporary_files() -> Iterator[None]:
+    """One folder for all temporary files of workers and stages, since a process that is ended cannot remove its own."""
+    before = os.environ.get("TMPDIR")
+    with tempfile.TemporaryDirectory(prefix="mrstrain-", ignore_cleanup_errors=True) as folder:
+        os.environ["TMPDIR"] = folder  # of the processes that are started meanwhile
+        try:
+            with dask.config.set({"temporary-directory": folder}):
+                yield
+        finally:
+            os.environ.pop("TMPDIR", None)
+            if before is not None:
+                os.environ["TMPDIR"] = before
 
 
 def _ignore_interrupts() -> None:

@@ -19,9 +19,6 @@ from mrstrain.studies.file import Study
 from mrstrain.studies.plan import COARSE, Stage, drawn_to_mesh, mesh_place
 from mrstrain.studies.time_left import Expected, TimeLeft
 
-CARE = "WARNING"
-"""Begins a line on too little memory or disk space."""
-
 # Seconds on one core, from 13 recorded demonstrations on two idle cores (2.3 million voxels; 35,000 or 80,000 cells,
 # four loads), and from registrations of 0.3 to 17 million voxels (benchmarks/results/register_scaling.json).
 _REGISTER_S, _MAPS_S_PER_MVOXEL = 8.0, 1.5  # in addition to the engine (`Cost`)
@@ -170,8 +167,8 @@ def _cost(study: Study) -> Cost:
 
 def costs(
     study: Study, stages: Sequence[Stage], left: Sequence[Stage], voxels: float, cells: float, workers: int
-) -> list[str]:
-    """Approximate time, memory and disk space of the stages that are ``left``, as sentences.
+) -> tuple[list[str], list[str]]:
+    """Approximate time, memory and disk space of the stages that are ``left``, and warnings if there is too little.
 
     ``workers`` is the number of stages at the same time; the other parameters are as in `seconds_of`.
     """
@@ -190,12 +187,11 @@ def costs(
             f"Of these, {len(further)} stages give the input uncertainty of the models and take about {added}; "
             "`mrstrain run --quick` skips them."
         )
-    if disk > free:
-        lines.append(f"{CARE}: there is too little free disk space.")
+    warnings = ["there is too little free disk space."] if disk > free else []
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
         smaller = "a single stage needs more. Crop the images, use a coarser mesh, or a machine with more memory."
         advice = f"run with workers={fitting} (--workers {fitting})." if fitting else smaller
-        lines.append(f"{CARE}: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
-    return lines
+        warnings.append(f"this machine has {there / _GIB:.1f} GiB of memory; {advice}")
+    return lines, warnings

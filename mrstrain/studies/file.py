@@ -276,7 +276,7 @@ def read_study(path: Path | str | Study) -> Study:
     place = Path(path)
     place = place / FILE if place.is_dir() else place
     try:
-        text = place.read_text(encoding="utf-8")
+        text = place.read_text(encoding="utf-8-sig")
         told = parse_toml(text)
     except FileNotFoundError as missing:
         raise InputError(f"{place}: there is no such study file; `mrstrain init FOLDER` writes one.") from missing

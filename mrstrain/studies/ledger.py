@@ -5,41 +5,23 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.software import software_key
+from dvc.threads import usable_cores
 from mrstrain.records.provenance import file_hash, without_folders
 from mrstrain.studies.plan import Stage
 from mrstrain.studies.stages import StageResult
 
 _RECORD, _REASON = ".json", ".failed.txt"
-
-
-class FileState(NamedTuple):
-    """A file as a stage wrote it: size in bytes, time of the last change in ns, and hash of its contents."""
-
-    size: int
-    changed_ns: int
-    sha256: str
-
-    @classmethod
-    def of(cls, path: Path) -> Self:
-        """The state of a file."""
-        state = path.stat()
-        return cls(state.st_size, state.st_mtime_ns, file_hash(path))
-
-    def is_that_of(self, path: Path) -> bool:
-        """Whether a file has these contents; they are read only where its time is another, as after copying."""
-        if not path.is_file() or (state := path.stat()).st_size != self.size:
-            return False
-        return state.st_mtime_ns == self.changed_ns or file_hash(path) == self.sha256
 
 
 class StageRecord(BaseModel):
@@ -53,7 +35,7 @@ class StageRecord(BaseModel):
     key: str  # hash of all inputs
     made_utc: str
     seconds: float
-    files: dict[str, FileState]  # that it wrote, by their place in the results folder
+    files: dict[str, str]  # hash of the contents of each file that it wrote, by its place in the results folder
     result: StageResult
     made_from: dict[str, Any] = {}  # hashes of its input files by name, and its arguments
     checksum: str = ""  # of all the others, as `sealed` computes it
@@ -124,8 +106,13 @@ class Ledger:
         if record.checksum != record.sealed().checksum:
             return None  # damaged: the stage is run again
         own = all(_within(self.out / name, stage.gives) for name in record.files)  # or it was tampered with
-        whole = own and all(state.is_that_of(self.out / name) for name, state in record.files.items())
-        return record if whole else None
+        return record if own and self._contents(record.files) == record.files else None
+
+    def _contents(self, names: Iterable[str]) -> dict[str, str]:
+        """Hash of the contents of each of these results that is there, whatever its size and date are."""
+        there = [name for name in names if (self.out / name).is_file()]
+        with ThreadPoolExecutor(usable_cores()) as pool:  # a gigabyte takes a core 1 to 3 s
+            return dict(zip(there, pool.map(lambda name: self._hash(self.out / name), there), strict=True))
 
     def clear(self, stage: Stage, reason: str = "", *, files: bool) -> None:
         """Mark a stage as not finished, record the reason, and remove its files unless it can resume from them."""
@@ -159,7 +146,7 @@ class Ledger:
         if lacking := [place for place in stage.gives if not place.exists()]:
             raise OutputError(f"{lacking[0]}: was removed while the study ran. Run it again.")
         made = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
-        files = {p.relative_to(self.out).as_posix(): FileState.of(p) for p in made if p.is_file()}
+        files = self._contents(p.relative_to(self.out).as_posix() for p in made)
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         record = StageRecord(
             stage=stage.name, key=key, made_utc=now, seconds=round(seconds, 1), files=files, result=result,

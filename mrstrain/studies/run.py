@@ -13,11 +13,11 @@ from dvc import Verdict
 from dvc.errors import InputError, ParameterError, few
 from dvc.io.result_folder import REPORT
 from dvc.memory import hand_memory_back
-from dvc.threads import usable_cores
+from mrstrain.options.measurement import in_parallel
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
-from mrstrain.studies.costs import CARE, costs, disk_bytes, expected, gib_of, sizes_of
+from mrstrain.studies.costs import costs, disk_bytes, expected, gib_of, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
@@ -137,7 +137,7 @@ def run_studies(
         )
     named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
     pipelines, to_do = _planned(named, only, force)
-    at_once, follower = workers or usable_cores(), follower or Follower()
+    at_once, follower = in_parallel(workers), follower or Follower()
     reports = {prefix: Report(study, pipelines[prefix], follower.on_report) for prefix, study in named.items()}
     expectations: dict[str, Expected] = {}
     watch = Watch(follower, reports, TimeLeft(expectations, at_once))
@@ -145,7 +145,7 @@ def run_studies(
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
 
-        return cluster(watch.told, [study.out for study in studies], scheduler=scheduler, workers=workers)
+        return cluster(watch.told, [study.out for study in studies], scheduler=scheduler, workers=at_once)
 
     logs: dict[str, Log] = {}
     needed: dict[int, list[float]] = defaultdict(list)  # bytes of the stages that write to each disk
@@ -165,7 +165,7 @@ def run_studies(
                 pipelines[prefix].seconds_to_end = seconds_to_end(of_stages)
                 pipelines[prefix].gib = {stage.name: gib_of(stage, study, voxels, cells) for stage in left}
                 if scheduler is None:
-                    _tell(costs(study, stages, left, voxels, cells, at_once), log)
+                    _tell(*costs(study, stages, left, voxels, cells, at_once), log)
         hand_memory_back()  # of the images that were checked
         with watch.reporting():
             run_all(pipelines, pool, logs, watch.ended)
@@ -179,12 +179,13 @@ def run_studies(
     return runs
 
 
-def _tell(lines: Sequence[str], log: Log) -> None:
+def _tell(lines: Sequence[str], warnings: Sequence[str], log: Log) -> None:
     """Log the estimates for a run; warnings also go to the logger."""
     for line in lines:
         log(line)
-        if line.startswith(CARE):
-            _warnings.warning(line)
+    for warning in warnings:
+        log(f"WARNING: {warning}")
+        _warnings.warning("WARNING: %s", warning)
 
 
 def _planned(

@@ -49,7 +49,7 @@ def read_errors(path: Path, outcomes: Mapping[str, StageOutcome]) -> dict[str, t
 def _rows(path: Path) -> list[dict[str, str]]:
     """Rows of an error table; none if the file is something else."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error):
         return []

@@ -13,8 +13,8 @@ from dvc.errors import InputError, MrstrainError
 from dvc.file_names import clash
 from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
-from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
+from mrstrain.options.measurement import in_parallel
 from mrstrain.records.inputs import alone, output_folder, refuse_small_disk
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
@@ -104,7 +104,7 @@ def accuracy(
     _refuse_one_name_for_two([*(run.case for run in runs.values()), *wanted])
     missing = [case for case in wanted if case.name not in runs]
     refuse_small_disk(target, len(missing) * _MEGABYTES * 1e6 + 20e6, "the study needs", ", or a smaller study")
-    at_once = max(1, min(workers or usable_cores(), len(missing)))
+    at_once = max(1, min(in_parallel(workers), len(missing)))
     if tell_plan is not None:
         minutes = max(expected_minutes(missing, at_once), 1.0) if missing else 0.0
         tell_plan(

@@ -1,8 +1,9 @@
 """Arguments are refused by their names where they are of another kind than their annotations say."""
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 import dvc
 import fe
 import phantoms
-from dvc.arguments import checked
+from dvc.arguments import check, checked
 from dvc.arrays import FloatArray, as_points
 from dvc.deformation.nodal import OnMesh
 from dvc.errors import InputError
@@ -86,6 +87,18 @@ MEASURE: list[tuple[dict[str, Any], str]] = [
 def test_measure_refuses_before_anything_is_registered(given: dict[str, Any], told: str) -> None:
     with pytest.raises(InputError, match=told):
         dvc.measure(**{"reference": IMAGE, "loaded": IMAGE, "bone": MASK, **given})
+
+
+class PathOfLoads:
+    """Not the path of a file, whatever its name says."""
+
+
+@pytest.mark.parametrize("hint", [Path, str | PathLike[str], Sequence[str | Path], Mapping[str, Path | str | None]])
+def test_text_with_a_null_character_is_no_path(hint: Any) -> None:
+    value: Any = {Sequence: ["a\0"], Mapping: {"a": "a\0"}}.get(get_origin(hint), Path("a\0"))
+    with pytest.raises(InputError, match="null character"):
+        check("file", value, hint)
+    check("load", "a\0", str | PathOfLoads)
 
 
 def test_others_refuse_as_well() -> None:

@@ -307,6 +307,15 @@ def test_a_load_that_is_unusual_for_tissue_is_told(load: LoadStep, gap_mm: float
     assert [bool(re.search(said, note)) for note in notes] == [True] * bool(said)
 
 
+@pytest.mark.parametrize(("gap_mm", "unit"), [(1e6, ""), (500.0, " Is it in micrometres?")])
+def test_a_gap_larger_than_the_body_is_refused(gap_mm: float, unit: str) -> None:
+    with pytest.raises(InputError) as told:
+        Problem(dome((2, 2, 2)), LAWS, Plate(DOWN, ALONG, gap_mm=gap_mm), PRESS)
+    said = f"(--gap-mm), is {gap_mm:g} mm, larger than the body (20 mm). Gaps are in mm.{unit}"
+    assert str(told.value).endswith(said)
+    assert Problem(dome((2, 2, 2)), LAWS, Plate(DOWN, ALONG, gap_mm=15.0), PRESS)
+
+
 def test_cells_that_are_there_twice_are_refused() -> None:
     mesh = dome((2, 2, 2))
     again = mesh.cells[[7, 3, 3, 20, 9]][:, [2, 0, 1, 3]]  # in another order

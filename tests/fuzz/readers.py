@@ -157,17 +157,17 @@ def _write_nodal_table(folder: Path) -> None:
     write_mesh(folder, "inp").with_suffix(".csv").write_text("\n".join(rows) + "\n")
 
 
-def _read_nodal_table(path: Path) -> None:
-    validate.read_result("model", path.with_suffix(".csv"), mesh=path.with_suffix(".inp"))
+def _read_nodal_table(path: Path) -> object:
+    return validate.read_result("model", path.with_suffix(".csv"), mesh=path.with_suffix(".inp"))
 
 
-def _read_model(path: Path) -> None:
+def _read_model(path: Path) -> object:
     path.with_name("Load1.csv").touch()
-    model_files(["Load1"], [path.parent], ModelReading())
+    return model_files(["Load1"], [path.parent], ModelReading())
 
 
-def _read_landmarks(path: Path) -> None:
-    read_landmarks(path if path.suffix == ".csv" else (path, path))
+def _read_landmarks(path: Path) -> object:
+    return read_landmarks(path if path.suffix == ".csv" else (path, path))
 
 
 def _write_measurement(folder: Path) -> None:
@@ -177,9 +177,8 @@ def _write_measurement(folder: Path) -> None:
     dvc.Measurement.from_deformation(stretch, subject, name="Load1").write(folder, record)
 
 
-def _read_measurement(path: Path) -> None:
-    str(dvc.Measurement.read(path.parent))
-    MeasuredWith.read(path.parent)
+def _read_measurement(path: Path) -> object:
+    return str(dvc.Measurement.read(path.parent)), MeasuredWith.read(path.parent)
 
 
 def _write_error_table(folder: Path) -> None:
@@ -211,8 +210,8 @@ def _write_scan_parameters(folder: Path) -> None:
     write_enhanced(folder / "enhanced.dcm")
 
 
-def _read_scan_parameters(path: Path) -> None:
-    read_scan_parameters(path.with_suffix(".nii") if path.suffix == ".json" else path)
+def _read_scan_parameters(path: Path) -> object:
+    return read_scan_parameters(path.with_suffix(".nii") if path.suffix == ".json" else path)
 
 
 def _write_comparison(folder: Path) -> None:

@@ -8,14 +8,15 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 
+from dvc.deformation.protocol import Affine
 from dvc.errors import ExtentError, GeometryError
 from dvc.images.image import Grid
 from dvc.mesh import TetMesh
 from mrstrain.comparison.model_files import ModelFile
 from mrstrain.options.modelling import ModelReading
-from tests.validate.test_comparison import SIDE, cube, labels, result, sheared
+from tests.validate.test_comparison import SIDE, case, cube, error_table, labels, result, sheared
 from tests.validate.test_fe_result import written
-from validate import Field, MappedFields, displacement_slip, map_fields, misfits
+from validate import Field, MappedFields, compare, displacement_slip, map_fields, misfits
 
 
 def pressed() -> MappedFields:
@@ -97,7 +98,31 @@ def test_cells_that_are_there_twice_are_told() -> None:
     mesh = cube(4)
     assert not misfits(result("once", mesh, sheared(0.1)), labels(), ["bone"])
     twice = TetMesh(mesh.points_mm, np.concatenate([mesh.cells, mesh.cells[5:10]]), mesh.regions, mesh.facets)
-    (note,) = misfits(result("twice", twice, sheared(0.1)), labels(), ["bone"])
-    assert note.startswith(
+    (odd,) = misfits(result("twice", twice, sheared(0.1)), labels(), ["bone"])
+    assert odd.told.startswith(
         f"twice: 5 of its {len(twice.cells)} tetrahedra are repeated (the first is number {len(mesh.cells)}"
     )
+
+
+@pytest.mark.parametrize(("moved_mm", "level"), [(0.5, None), (3.0, "caution"), (134.0, "distrust")])
+def test_a_model_whose_bone_moves_is_told_and_one_that_moves_far_is_not_trusted(
+    moved_mm: float, level: str | None
+) -> None:
+    mesh, at_rest = cube(4), Affine(np.array([[1.0, 0.0, 0.0], [0.4, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    moved = replace(at_rest, translation_mm=np.array([0.0, 0.0, moved_mm]))
+    models = [result("right", mesh, at_rest), result("moved", mesh, moved)]
+    odd = misfits(models[1], labels(), ["bone"])
+    assert [one.level for one in odd] == [level] * (level is not None)
+    done = compare([case("Load1", at_rest, models, error_table(0.0, 0.01))], labels())
+    (under,) = done.ranking.statements
+    not_trusted = " The verdict on moved is Do not trust."
+    if level is None:
+        assert done.verdict is None
+    else:
+        assert done.verdict.level == level
+        assert f"Load1: moved: the model moves by {moved_mm:g}" in done.verdict.reasons[0]
+    assert under.endswith(not_trusted) == (level == "distrust")
+    if level == "distrust":
+        assert "unit and frame of the displacements, and that they are in the order of the nodes" in odd[0].told
+        several = [case(load, at_rest, models, error_table(0.0, 0.01)) for load in ("Load1", "Load2")]
+        assert all(one.endswith(not_trusted) for one in compare(several, labels()).ranking.statements)

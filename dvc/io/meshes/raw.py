@@ -130,7 +130,7 @@ class NumberedMesh:
 def read_text(path: Path) -> str:
     """The text of a mesh file; what is not UTF-8 stands as a mark that no number has."""
     try:
-        return path.read_text(encoding="utf-8", errors="replace")
+        return path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise ImageFileError(f"{path}: cannot be read ({error.strerror}).") from error
 

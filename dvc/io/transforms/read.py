@@ -199,7 +199,7 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
     if path.resolve() in chain:
         raise ParameterError(f"{path}: the chain of initial transforms leads back to this file.")
     try:
-        parameters = parse_parameters(path.read_text())
+        parameters = parse_parameters(path.read_text(encoding="utf-8-sig"))
         last = _last_of_chain(path, parameters)
     except (OSError, UnicodeDecodeError) as failure:
         raise InputError(f"{path}: cannot be read as an elastix transform file ({failure}).") from failure

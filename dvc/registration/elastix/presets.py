@@ -115,7 +115,7 @@ def read_parameter_file(path: Path | str, *, allow_unknown: bool = False) -> Pre
         For a name or component that elastix does not know; the message gives the closest known name.
     """
     try:
-        text = Path(path).read_text()
+        text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as failure:
         raise InputError(f"{path}: the elastix parameter file cannot be read ({failure}).") from failure
     return _checked(Path(path).name, text, allow_unknown=allow_unknown)

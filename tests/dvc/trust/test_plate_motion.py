@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from dvc.deformation.protocol import Affine
-from dvc.deformation.strain import plate_axes
 from dvc.deformation.strain_maps import strain_maps
-from dvc.images.image import Grid, Mask
+from dvc.images.image import Grid, Image, Mask
+from dvc.measurement.measurement import Measurement
+from dvc.measurement.subject import Subject
 from dvc.trust.assessment import Similarity, assess
 from dvc.trust.plate_motion import displacement_along_normal
 
 GRID = Grid((30, 26, 40), np.array([1.0, 1.2, 1.5]), np.array([-15.0, 5.0, -30.0]))
 WHOLE = Mask(GRID, np.ones(GRID.shape, dtype=bool))
 ALIKE = Similarity((0.3, 0.5, 0.9))
-INFERIOR = plate_axes((0.0, 0.0, -1.0), (0.0, -1.0, 0.0))
+INFERIOR = np.array([0.0, 0.0, -1.0])
 LOWEST_MM, BONE_MM = -30.0, -7.5  # of the tissue, and of the bone, along superior
 
 
@@ -30,8 +31,8 @@ def pressed(by: float) -> Affine:
     return Affine(np.diag([1.0, 1.0, 1.0 - by]), np.array([0.0, 0.0, by * BONE_MM]))
 
 
-def along_normal(deformation: Affine, axes: np.ndarray = INFERIOR, tissue: Mask = WHOLE) -> float:
-    return displacement_along_normal(strain_maps(deformation, tissue), tissue, bone(), axes)
+def along_normal(deformation: Affine, normal: np.ndarray = INFERIOR, tissue: Mask = WHOLE) -> float:
+    return displacement_along_normal(strain_maps(deformation, tissue), tissue, bone(), normal)
 
 
 @pytest.mark.parametrize("by", [0.2, -0.2])
@@ -48,16 +49,16 @@ def test_tissue_beside_the_bone_and_beyond_it_does_not_count() -> None:
 
 
 def test_a_plate_from_another_side_sees_another_surface() -> None:
-    posterior = plate_axes((0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
+    posterior = np.array([0.0, 1.0, 0.0])
     bulging = Affine(np.diag([1.0, 1.1, 1.0]), np.array([0.0, -0.1 * 5.0, 0.0]))  # from the anterior side at 5 mm
     outer = GRID.points()[0, -3:, 0, 1]
     assert along_normal(bulging, posterior) == pytest.approx(float((0.1 * (outer - 5.0)).mean()), abs=1e-5)
 
 
 def test_a_loaded_image_taken_for_the_unloaded_one_is_used_with_care() -> None:
-    def level_and_reasons(by: float, axes: np.ndarray | None) -> tuple[str, str]:
+    def level_and_reasons(by: float, normal: np.ndarray | None) -> tuple[str, str]:
         quality = assess(strain_maps(pressed(by), WHOLE), WHOLE, bone(), similarity=ALIKE, in_bone=(0.0, 0.0),
-                         plate_axes=axes)  # fmt: skip
+                         plate_normal=normal)  # fmt: skip
         return quality.verdict.level, " ".join(quality.verdict.reasons)
 
     level, reasons = level_and_reasons(-0.1, INFERIOR)
@@ -66,3 +67,12 @@ def test_a_loaded_image_taken_for_the_unloaded_one_is_used_with_care() -> None:
     assert "swapped" in reasons
     assert level_and_reasons(0.1, INFERIOR) == level_and_reasons(-0.02, INFERIOR) == ("trust", "")
     assert level_and_reasons(-0.1, None) == ("trust", "")  # it is not known that a plate presses
+
+
+def test_a_measurement_is_judged_by_the_normal_alone() -> None:
+    def reasons(**known: object) -> str:
+        subject = Subject(Image(GRID, np.ones(GRID.shape, dtype=np.float32)), bone(), WHOLE, **known)
+        return " ".join(Measurement.from_deformation(pressed(-0.1), subject).verdict.reasons)
+
+    assert "swapped" in reasons(plate_normal=INFERIOR, pressed=True)
+    assert "swapped" not in reasons(plate_normal=INFERIOR)

@@ -15,6 +15,7 @@ from dvc.trust.verdict import Verdict
 from mrstrain.comparison.compare import Compared, compare
 from tests.mrstrain.comparison.test_compare import given, rows, with_errors
 from tests.validate.test_comparison import cube, sheared
+from validate import Misfit
 from validate.comparison import verdict_on
 
 
@@ -69,7 +70,9 @@ def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(stu
         ("All 2 registrations passed all checks. This is a verdict on the measurement; the models are judged below.",),
     )
     assert verdict_on(dict.fromkeys(sound)) is None
-    assert verdict_on(sound, ["It is mirrored."]) == Verdict("caution", ("It is mirrored.",))
+    odd = [Misfit("Load1", "turned", "It is mirrored."), Misfit("Load1", "far", "It is far away.", "distrust")]
+    assert verdict_on(sound, odd[:1]) == Verdict("caution", ("It is mirrored.",))
+    assert verdict_on(sound, odd) == Verdict("distrust", ("It is far away.", "It is mirrored."))
     # a model's displacement in the other frame than its mesh is a reason for care beside the registration's
     judged(study, Load1="distrust", Load2="caution")
     mesh = cube(6)

@@ -13,6 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 import mrstrain
+from dvc import Settings
 from dvc.errors import InputError, ParameterError
 from mrstrain.cli.app import app
 from mrstrain.cli.options import _plain, takes_options
@@ -33,6 +34,7 @@ from mrstrain.options.measurement import (
     Seeded,
     SubjectFiles,
     Threads,
+    in_parallel,
 )
 from mrstrain.options.model import Options
 from mrstrain.options.modelling import (
@@ -324,3 +326,18 @@ def test_paths_vectors_and_numbers_may_come_as_numpy_and_text() -> None:
             RegistrationOptions.of({"bending": wrong})
     with pytest.raises(TypeError, match="bendin"):
         mrstrain.register("a", ["b"], out="c", bendin=3.0)
+
+
+def test_far_too_many_threads_are_refused_and_workers_limited_with_the_number_of_cores(monkeypatch, caplog) -> None:
+    for module in ("dvc.threads", "dvc.registration.register", "mrstrain.options.measurement"):
+        monkeypatch.setattr(f"{module}.usable_cores", lambda: 2)
+    told = CliRunner().invoke(app, ["simulate", "m.vtu", "--load", "a=1", "--threads", "100000", "--out", "out"])
+    assert str(told.exception) == "--threads: must be 256 or less (cores of this machine: 2); got 100000."
+    with pytest.raises(ParameterError, match=r"must be 1 to 256; got 100000\. This machine has 2 cores\."):
+        Settings(threads=100000)
+    assert Threads(threads=256).threads == Settings(threads=256).threads == 256
+    assert (in_parallel(None), in_parallel(1), in_parallel(2)) == (2, 1, 2)
+    assert caplog.messages == []
+    assert in_parallel(100000) == 2
+    assert caplog.messages == ["workers=100000: this machine has 2 cores, so at most as many jobs run in parallel."]
+    assert Running(workers=100000).shares(8) == (2, 1)

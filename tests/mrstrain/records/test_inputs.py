@@ -12,7 +12,7 @@ from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.images.image import Grid, Image
 from dvc.io.images.write import write_image
 from mrstrain.measurement.register import register
-from mrstrain.options.measurement import SubjectFiles
+from mrstrain.options.measurement import MeshAndAxes, SubjectFiles
 from mrstrain.records.inputs import (
     alone,
     case_names,
@@ -23,6 +23,22 @@ from mrstrain.records.inputs import (
     refuse_touching_inputs,
 )
 from mrstrain.studies.run import run_studies
+
+
+@pytest.mark.parametrize(
+    ("directions", "pressed"),
+    [({}, False), ({"plate_normal": (0, 1, 0)}, True), ({"shear_direction": (0, 1, 0)}, True)],
+)
+def test_a_plate_presses_where_a_direction_of_it_is_given(tmp_path: Path, directions: dict, pressed: bool) -> None:
+    """With the normal alone, too: the tissue under the bone must then move away from the plate."""
+    image = tmp_path / "Load0.nii.gz"
+    write_image(image, Image(Grid((4, 4, 4), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), np.arange(64.0).reshape(4, 4, 4)))
+    subject = read_subject(image, SubjectFiles(), MeshAndAxes(**directions))
+    normal = directions.get("plate_normal", (0, 0, -1))
+    assert (subject.pressed_along is None) == (not pressed)
+    assert subject.plate_normal.tolist() == list(normal)
+    if pressed:
+        assert subject.pressed_along.tolist() == list(normal)
 
 
 def test_arguments_are_named_without_the_dashes_of_the_command_line(tmp_path: Path) -> None:

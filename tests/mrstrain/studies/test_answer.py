@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dvc.measurement.page import summary_table
-from dvc.report.page import Section, Table
+from dvc.report.page import Estimate, Section, Table
 from dvc.trust.quality import NoiseFloor
 from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
@@ -52,6 +52,7 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
         "The most strained tissue is fat under Load1: measured maximum shear strain 0.131 (0.030 to 0.139) in the "
         "median and 0.420 at the 95th percentile.",
     )
+    table = replace(table, rows=tuple(tuple(map(str, row)) for row in table.rows))
     assert table.columns == ("load", "tissue", "median", "95th percentile", "best match")
     assert table.rows == (
         ("Load1", "fat", "0.131 (0.030 to 0.139)", "0.420", "near (half)"),
@@ -94,22 +95,27 @@ def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_
 
 
 def test_the_most_strained_tissue_is_surely_so() -> None:
+    fat = Estimate(0.3, (0.2, 0.4)), Estimate(0.419, (0.4, 0.5))
     rows = (
-        ("Load1", "muscle", "0.1 (0.0 to 0.2)", "0.41 (0.405 to 0.46)"),
-        ("Load1", "fat", "0.3 (0.2 to 0.4)", "0.419 (0.4 to 0.5)"),
-        ("Load2", "tendon", "0.3 (0.1 to 0.4)", "0.464 (0.180 to 0.759)"),
-        ("Load2", "skin", "–", "–"),
+        ("Load1", "muscle", Estimate(0.1, (0.0, 0.2)), Estimate(0.41, (0.405, 0.46))),
+        ("Load1", "fat", *fat),
+        ("Load2", "tendon", Estimate(0.3, (0.1, 0.4)), Estimate(0.464, (0.180, 0.759))),
+        ("Load2", "skin", Estimate(np.nan), Estimate(np.nan)),
     )
     columns = ("load", "tissue", "median", "95th percentile")
     beside = MeasuredBeside({"Load1": "140 N"}, NoiseFloor(0.01, 0.01, 0.0112, 0.0292, 0.1))
     assert most_strained(Table("Measured", columns, rows), beside) == (
-        "The most strained tissue is fat under Load1 (140 N): measured maximum shear strain 0.3 (0.2 to 0.4) in the "
-        "median and 0.419 (0.4 to 0.5) at the 95th percentile, with 95 % intervals in brackets. The noise floor is "
-        "0.011 and 0.029.",
+        "The most strained tissue is fat under Load1 (140 N): measured maximum shear strain 0.300 (0.200 to 0.400) in "
+        "the median and 0.419 (0.400 to 0.500) at the 95th percentile, with 95 % intervals in brackets. The noise "
+        "floor is 0.011 and 0.029.",
     )
-    without = ((*rows[1][:2], "0.3", "0.41"), (*rows[2][:2], "0.3", "0.42"))
+    below_zero = ("Load2", "tendon", fat[0], Estimate(0.5, (-0.45, 0.759)))
+    assert "is fat under Load1" in most_strained(Table("Measured", columns, (rows[1], below_zero)))[0]
+    alike = {"fat": 0.4195, "skin": 0.4202}  # 0.420 in the table
+    without = tuple(("Load1", name, Estimate(0.3), Estimate(high)) for name, high in alike.items())
     (plain,) = most_strained(Table("Measured", columns, without))
-    assert plain.startswith("The most strained tissue is tendon under Load2: ")
+    assert plain.startswith("The most strained tissue is skin under Load1: ")
+    assert plain.endswith("0.300 in the median and 0.420 at the 95th percentile.")
     assert most_strained(Table("Measured", columns, rows[3:])) == most_strained(None) == ()
 
 

@@ -80,18 +80,19 @@ def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study
     assert wrong(study, ('"mine.toml", ', "")) == ""
 
 
-def test_odd_materials_and_forces_are_told_before_a_run(study):
+def test_odd_materials_forces_and_gaps_are_told_before_a_run(study):
     (study / "stiff.toml").write_text('[stiff]\ntitle = "kPa typed as MPa"\n[stiff.fat]\nlaw = "neo-Hooke"\n'
                                       "mu_mpa = 10.0\nnu = 0.49\n")  # fmt: skip
     text = (study / "study.toml").read_text()
     changed = text.replace('"mine.toml"', '"stiff.toml"').replace("normal_n = 15.0", "normal_n = 1e9", 1)
     assert changed != text
     (study / "study.toml").write_text(changed)
-    warnings = [note for note in check(study).notes if note.startswith("WARNING: ")]
+    warnings = check(study).warnings
     assert any("stiff: " in note and "fat" in note and "kPa" in note for note in warnings), warnings
     assert any("a force of 1e+09 N is several times the weight of a person" in note for note in warnings), warnings
     (study / "study.toml").write_text(text)
-    assert not any("several times" in note for note in check(study).notes)
+    assert not any("several times" in warning for warning in check(study).warnings)
+    assert "gap_mm (--gap-mm), is 1e+06 mm, larger" in wrong(study, ("[plate]", "[plate]\ngap_mm = 1e6"))
 
 
 def test_the_command_ends_with_status_2_where_something_is_wrong_and_0_where_nothing_is(study):
@@ -153,7 +154,7 @@ def test_images_on_one_grid_stand_in_one_line_and_another_grid_is_seen(study):
 
 def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
     def told() -> list[str]:
-        return [note for note in check(study).notes if note.startswith("WARNING: talus")]
+        return [warning for warning in check(study).warnings if warning.startswith("talus")]
 
     assert told() == []
     values = np.ones(GRID.shape, dtype=np.int64)
@@ -162,8 +163,7 @@ def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
     assert told() == []  # every label that is named like a bone is one
     (study / "study.toml").write_text(STUDY.replace("[mesh]", '[mesh]\nbones = ["bone"]'))
     assert told() == [
-        "WARNING: talus will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] "
-        "bones."
+        "talus will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] bones."
     ]
 
 
@@ -187,8 +187,8 @@ def test_labels_that_are_made_later_are_checked_by_what_they_are_made_from(study
 def test_labels_without_a_boundary_to_correct_are_told(study):
     asked = ('names = "tissues.csv"', 'names = "tissues.csv"\ncorrect_labels = true')
     assert wrong(study, asked, ('"mine.toml", ', "")) == ""
-    told = [note for note in check(study).notes if "correct_labels" in note]
-    assert told == ["WARNING: no label is named skin, so correct_labels corrects only bones."]
+    told = [warning for warning in check(study).warnings if "correct_labels" in warning]
+    assert told == ["no label is named skin, so correct_labels corrects only bones."]
     values = np.ones(GRID.shape, dtype=np.int64)
     values[:4] = 2
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "heel"}))
@@ -196,7 +196,7 @@ def test_labels_without_a_boundary_to_correct_are_told(study):
     values[:2] = 3
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "heel", 3: "skin"}))
     assert "correct_labels" not in wrong(study, asked)
-    assert "WARNING: no label is named like a bone, so correct_labels" in "\n".join(check(study).notes)
+    assert "no label is named like a bone, so correct_labels" in "\n".join(check(study).warnings)
 
 
 def test_a_plate_without_friction_carries_no_shear(study):

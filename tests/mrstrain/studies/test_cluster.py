@@ -7,10 +7,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -178,6 +179,21 @@ def test_a_stage_leaves_nothing_in_the_memory_of_its_worker(images, tmp_path):
         (loaded,) = runner._client.run(lambda: {*sys.modules}).values()
     assert "mrstrain.studies.stages" in loaded
     assert not loaded & {"fe", "numba", "scipy.ndimage", "SimpleITK", "matplotlib", "vtk", "mrstrain.models.mesh"}
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt])
+def test_temporary_files_of_workers_are_removed(tmp_path, monkeypatch, error):
+    """And those of a stage that is ended with its worker, which cannot remove them."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = os.environ.get("TMPDIR")
+    with pytest.raises(error) if error else nullcontext(), cluster(lambda *_: None, [], workers=1) as runner:
+        (kept,) = runner._client.run(tempfile.mkdtemp).values()
+        (folder,) = tmp_path.iterdir()
+        assert folder in Path(kept).parents
+        if error is not None:
+            raise error
+    assert list(tmp_path.iterdir()) == []
+    assert os.environ.get("TMPDIR") == before
 
 
 def test_freed_arrays_serve_the_next_in_a_worker(of_this_machine):

@@ -92,19 +92,19 @@ def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, mo
 
     def care(gib: float, workers: int = 3) -> list[str]:
         monkeypatch.setattr(costs, "usable_memory_bytes", lambda: int(gib * 1024**3))
-        return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("WARNING")]
+        return costs.costs(told, left, left, 256.0**3, 0.0, workers)[1]
 
     assert care(12.0) == []  # three of 3.9 GiB
-    assert care(8.0) == ["WARNING: this machine has 8.0 GiB of memory; run with workers=2 (--workers 2)."]
+    assert care(8.0) == ["this machine has 8.0 GiB of memory; run with workers=2 (--workers 2)."]
     assert care(8.0, workers=2) == []
     assert "Crop the images" in care(3.0)[0]
 
 
 def test_what_a_machine_has_too_little_of_is_said_before_a_run_and_logged(caplog):
-    lines, logged = ["To do: 1 of 1 stages", "WARNING: this machine has 1.0 GiB of memory"], list[str]()
-    _tell(lines, logged.append)
-    assert logged == lines
-    assert caplog.messages == lines[1:]
+    logged = list[str]()
+    _tell(["To do: 1 of 1 stages"], ["this machine has 1.0 GiB of memory"], logged.append)
+    assert logged == ["To do: 1 of 1 stages", "WARNING: this machine has 1.0 GiB of memory"]
+    assert caplog.messages == logged[1:]
 
 
 def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
@@ -118,7 +118,7 @@ def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
     one = costs.seconds_of(first, told, 1e6, 0.0)
 
     def time(stages: list[Stage]) -> str:
-        return costs.costs(told, stages, stages, 1e6, 0.0, 8)[0].split("about ")[1].split(" on")[0]
+        return costs.costs(told, stages, stages, 1e6, 0.0, 8)[0][0].split("about ")[1].split(" on")[0]
 
     assert time(apart) == duration(one)
     assert time(row) == duration(4 * one)

@@ -79,8 +79,10 @@ def computed_s(processes: list[psutil.Process]) -> dict[int, float]:
 
 
 @pytest.mark.parametrize("group", [slow(False, id="process"), pytest.param(True, id="group")])
-def test_a_study_ends_and_goes_on(images, tmp_path, group):
-    study = tmp_path / "study"
+def test_a_study_ends_and_goes_on(images, tmp_path, group, monkeypatch):
+    study, temporary = tmp_path / "study", tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
     shutil.copytree(images, study)
     records = study / "results" / ".study"
     command = ["run", str(study), "--only", "register", "--workers", "1"]
@@ -90,6 +92,7 @@ def test_a_study_ends_and_goes_on(images, tmp_path, group):
     assert told["register repeat"] == "up to date"
     assert told["register Load1"] == "will run"
     assert "interrupted" in (study / "results" / "report.html").read_text().lower()
+    assert list(temporary.iterdir()) == []
 
 
 def test_a_study_whose_processes_hang_ends_and_leaves_nothing_in_shared_memory(images, tmp_path):
@@ -191,6 +194,47 @@ def test_a_command_ends_and_keeps_what_is_finished(case, group, images, tmp_path
     assert not made.absent.exists()
     if case is measuring_accuracy:
         assert [run.case.motion for run in _finished(tmp_path / "out" / "runs").values()] == ["still"]
+
+
+IN_A_TERMINAL = """
+import fcntl, os, sys, termios
+
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.executable, [sys.executable, "-m", "mrstrain", *sys.argv[1:]])
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="a terminal that is closed sends SIGHUP")
+def test_a_command_ends_with_its_terminal(images, tmp_path):
+    """What is finished is kept, as after Ctrl-C."""
+    case = simulating(images, tmp_path)
+    master, terminal = os.openpty()
+    os.set_blocking(master, False)
+    process = subprocess.Popen(
+        [sys.executable, "-c", IN_A_TERMINAL, *case.command], stdin=terminal, stdout=terminal, stderr=terminal,
+        start_new_session=True,
+    )  # fmt: skip
+    os.close(terminal)
+
+    def begun() -> bool:
+        with suppress(BlockingIOError):
+            os.read(master, 1 << 16)  # a full terminal would stop the command
+        return case.begun(psutil.Process(process.pid))
+
+    try:
+        wait_for(begun, process)
+        below = psutil.Process(process.pid).children(recursive=True)
+        assert below
+        os.close(master)
+        wait_for(lambda: process.poll() is not None and all(is_gone(one.pid) for one in below), limit_s=OVER_S)
+        assert process.returncode == 128 + signal.SIGTERM
+        assert case.kept is not None
+        assert case.kept.is_file()
+        assert not case.absent.exists()
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 NOTEBOOK = """
