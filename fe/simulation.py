@@ -286,7 +286,7 @@ class Simulation:
         content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
         write_json(place / RECORD, content | dict(record or {"parameters": parameters}))
         save_figure(place / "slices", self.plot())
-        save_figure(place / "force_travel", figures.force_displacement(self.states))
+        save_figure(place / "force_displacement", figures.force_displacement(self.states))
 
     def write_decks(self, folder: Path | str) -> None:
         """Write input files of each load with quadratic tetrahedra: ``LOAD.inp`` (CalculiX), ``LOAD.feb`` (FEBio 4).

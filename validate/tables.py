@@ -28,11 +28,12 @@ from validate.mavm import ModelForm
 
 RECORD = "comparison.json"
 TABLES = {
-    "areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement,
-    "decomposition.csv": Representation, "mavm.csv": ModelForm,
+    "areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement,
+    "skin_displacement.csv": SkinDisplacement, "decomposition.csv": Representation, "mavm.csv": ModelForm,
     "comparison_error.csv": ComparisonError,
 }  # fmt: skip
 _LATER = (Representation, ModelForm, ComparisonError)  # older comparisons have no such table
+_BEFORE = {"skin_displacement.csv": "travel.csv"}  # names in older comparisons
 CURVES = "curves.csv"
 OF_ALL_LOADS = ("slices_by_load", "curves_by_load")
 """Stems of the figures under all loads."""
@@ -91,12 +92,15 @@ def read_tables(folder: Path) -> list[tuple[Any, ...]]:
     """Rows of each of the `TABLES`, to the six digits of the file; InputError if a file is not such a table."""
     tables: list[tuple[Any, ...]] = []
     for name, kind in TABLES.items():
+        path = folder / name
+        if name in _BEFORE and not path.is_file():
+            path = folder / _BEFORE[name]
         readers = get_type_hints(kind)  # int, float or str
-        if kind in _LATER and not (folder / name).is_file():
+        if kind in _LATER and not path.is_file():
             tables.append(())
             continue
-        rows = _rows(folder / name, readers)
-        with _damage_named(folder / name):
+        rows = _rows(path, readers)
+        with _damage_named(path):
             tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))
     return tables
 
@@ -140,7 +144,7 @@ def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
     except (OSError, ValueError, KeyError, TypeError):
         return
     pictures = (path for stem in OF_ALL_LOADS for path in figure_files(folder / stem))
-    for path in (*(folder / name for name in (*TABLES, CURVES, RECORD, "report.html")), *pictures):
+    for path in (*(folder / name for name in (*TABLES, *_BEFORE.values(), CURVES, RECORD, "report.html")), *pictures):
         path.unlink(missing_ok=True)
     for load in earlier:
         if load not in loads and (folder / load / "fields.vtu").is_file():

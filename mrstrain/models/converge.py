@@ -138,7 +138,7 @@ def converge(
 def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], float]:
     """Quantities compared between meshes, by load and name: plate displacement, and percentiles of the max. shear."""
     moved = {state.load.name: float(np.hypot(*state.plate_displacement_mm[:2])) for state in simulation.states}
-    return {(load, "plate displacement, mm"): travel for load, travel in moved.items()} | {
+    return {(load, "plate displacement, mm"): value for load, value in moved.items()} | {
         (row.load, f"{_SHEAR} of {region}, p{percent}"): value
         for row in simulation.regions
         if row.region == region

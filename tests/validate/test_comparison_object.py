@@ -21,7 +21,7 @@ from tests.validate.test_comparison import case, cube, error_table, labels, max_
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
 from validate.ranking import rank_over_loads
 from validate.report import area_rows, load_sections, overview
-from validate.tables import read_curves
+from validate.tables import read_curves, remove_earlier
 
 ROWS = ("areas", "overlaps", "agreements", "skin", "representations", "model_forms")
 GAMMAS = {"half": 0.2, "double": 0.8}
@@ -112,6 +112,15 @@ def test_a_folder_without_a_comparison_is_refused(folder: Path, tmp_path: Path) 
     (tmp_path / "curves.csv").write_text(re.sub(r"(\d)\.(\d)", r"\1..\2", whole))
     with pytest.raises(InputError, match=r"curves\.csv: the table of the comparison is damaged .* Compare again"):
         read_curves(tmp_path)
+
+
+def test_an_older_comparison_has_another_name_of_a_table(folder: Path, tmp_path: Path) -> None:
+    for path in folder.glob("*.*"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "skin_displacement.csv").rename(tmp_path / "travel.csv")
+    assert Comparison.read(tmp_path).skin == Comparison.read(folder).skin != ()
+    remove_earlier(tmp_path, [])
+    assert not (tmp_path / "travel.csv").exists()
 
 
 def test_a_notebook_shows_the_answer_the_areas_and_the_curves(comparison: Comparison) -> None:

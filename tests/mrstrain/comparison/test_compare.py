@@ -78,8 +78,8 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     assert float(right["dice_high"]) == 1.0
     assert float(right["dice_perfect"]) > 0.95
     assert float(places["half", "Load1", "0.3"]["dice_high"]) < 0.5
-    travel = {(r["model"], r["load"]): r for r in rows(study / "out" / "travel.csv")}
-    assert float(travel["right", "Load1"]["model_along_mm"]) >= 0.0
+    skin = {(r["model"], r["load"]): r for r in rows(study / "out" / "skin_displacement.csv")}
+    assert float(skin["right", "Load1"]["model_along_mm"]) >= 0.0
     for load, gamma in LOADS.items():
         names = {p.name for p in (study / "out" / load).iterdir()}
         assert names >= {
@@ -187,8 +187,8 @@ def test_a_load_is_looked_at_along_its_own_directions(study: Path) -> None:
     """Of a shear along y the plate across x moves 'along', that across y goes in."""
     own = {"Load2": ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))}
     compare(study / "measured", [study / "right"], **given(study), towards=own)
-    travel = {r["load"]: r for r in rows(study / "out" / "travel.csv")}
-    usual, aside = (float(travel[load]["model_along_mm"]) for load in LOADS)
+    skin = {r["load"]: r for r in rows(study / "out" / "skin_displacement.csv")}
+    usual, aside = (float(skin[load]["model_along_mm"]) for load in LOADS)
     assert usual > 0.5
     assert aside < 0.05
     told = json.loads((study / "out" / "comparison.json").read_text())["parameters"]

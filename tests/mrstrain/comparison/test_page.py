@@ -31,7 +31,7 @@ def pressed(along: float, across: float) -> Affine:
     return Affine(matrix, np.zeros(3))
 
 
-def test_travel_is_positive_towards_the_foot_and_volume_change_that_of_the_map() -> None:
+def test_displacement_of_the_skin_is_positive_towards_the_foot_and_volume_change_that_of_the_map() -> None:
     mesh = cube(6)
     model = result("model", mesh, pressed(0.05, -0.1))
     found = map_fields(mesh, labels(), ["bone"], pressed(0.1, 0.05), {"model": model.deformation})

@@ -49,7 +49,7 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
     assert told["verdict"]["reasons"][0] == reason
     assert told["verdict_by_load"]["Load2"] == {"level": "distrust", "reasons": ["The map of Load2 folds."]}
     assert told["verdict_by_load"]["Load1"]["level"] == "trust"
-    for table in ("areas", "location", "agreement", "travel", "curves"):
+    for table in ("areas", "location", "agreement", "skin_displacement", "curves"):
         levels = {(r["load"], r["verdict"]) for r in rows(study / "out" / f"{table}.csv")}
         assert levels == {("Load1", "trust"), ("Load2", "distrust")} | (
             {("all loads", "distrust")} if table == "areas" else set()

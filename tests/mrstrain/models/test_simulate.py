@@ -79,8 +79,8 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         assert [file["name"] for file in told["inputs"]["sets"]] == ["mine.toml"]
         assert "C3D10" in (folder / "Load3.inp").read_text()
         assert (folder / "slices.png").stat().st_size > 10_000
-        assert (folder / "force_travel.png").stat().st_size > 5_000
-        assert {path.name for path in folder.glob("*.pdf")} == {"slices.pdf", "force_travel.pdf"}
+        assert (folder / "force_displacement.png").stat().st_size > 5_000
+        assert {path.name for path in folder.glob("*.pdf")} == {"slices.pdf", "force_displacement.pdf"}
         regions = np.genfromtxt(folder / "regions.csv", delimiter=",", names=True, dtype=None, encoding=None)
         assert len(regions) == 6
         assert (np.abs(regions["volume_change"]) < 0.02).all()
