@@ -14,6 +14,8 @@ ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = ROOT / "docs" / "glossary.md"
 PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")
 QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"")  # names as they were, in the changelog
+CODE = re.compile(r"`[^`]*`|sets\s*=|(?:\[models\] |\{\{? ?|[-.\"'])sets\b")  # the name in code
+SETS = re.compile(r"(?<!material )(?<!surface )(?<!node )(?<!element )\bsets\b(?! of| up)", re.IGNORECASE)
 NOT_FOR_USERS = {"decisions", "api"}  # a record of its time; made from docstrings
 
 
@@ -63,11 +65,21 @@ def found(words: str, texts: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{place}: {match[0]!r}" for place, text in texts for match in pattern.finditer(text)]
 
 
+def sets_alone(texts: Iterable[tuple[str, str]]) -> list[str]:
+    """Where "sets" stands without the word that says of what: material, surface, node, element, or "sets of"."""
+    prose = [(place, " ".join(CODE.sub("", text).split())) for place, text in texts if text != "sets"]
+    return [
+        f"{place}: {text[max(at.start() - 30, 0) : at.end()]!r}" for place, text in prose for at in SETS.finditer(text)
+    ]
+
+
 def test_the_glossary_has_its_forbidden_twins() -> None:
     assert {"shading", "told apart", "maximal shear"} <= set(forbidden())
     assert {"confidence interval", "how accurate", "how sure", "error margin"} <= set(forbidden())
     assert found("told apart", [("here", "A is told\n    apart from B")]) == ["here: 'told\\n    apart'"]
     assert not found("travel", [("here", "travelling")])
+    assert len(sets_alone([("here", "The published sets, of\nwhich three sets need care; all sets")])) == 3
+    assert not sets_alone([("here", "material\n  sets and surface sets, `sets`, sets = [], a.sets; sets of nodes")])
 
 
 def test_terms_of_measurement_quality_are_those_of_the_vim_and_say_where_they_are_used() -> None:
@@ -98,3 +110,7 @@ def test_no_page_uses_another_name(words: str) -> None:
 @pytest.mark.parametrize("words", forbidden())
 def test_no_message_or_docstring_uses_another_name(words: str) -> None:
     assert not found(words, strings())
+
+
+def test_sets_are_named_by_their_kind() -> None:
+    assert not sets_alone([*pages(), *strings()])
