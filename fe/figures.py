@@ -75,7 +75,8 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
     assert axes is not None
     fields, middle = [], _lowest_bone_point(mesh, axes)
     for state in states:
-        title = f"{state.load.name}: {state.load}{'' if state.reached == 1.0 else f' (ONLY {state.reached:.0%})'}"
+        part = "" if state.reached == 1.0 else f" (ONLY {100 * state.reached:.0f} %)"
+        title = f"{state.load.name}: {state.load}{part}"
         fields.append(Slice(title, state.u_mm, state.strain.max_shear, _along_plate(mesh, state, axes, middle)))
     return slice_sheet(mesh, fields, axes, middle)
 

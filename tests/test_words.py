@@ -16,6 +16,7 @@ PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")
 QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"")  # names as they were, in the changelog
 CODE = re.compile(r"`[^`]*`|sets\s*=|(?:\[models\] |\{\{? ?|[-.\"'])sets\b")  # the name in code
 SETS = re.compile(r"(?<!material )(?<!surface )(?<!node )(?<!element )\bsets\b(?! of| up)", re.IGNORECASE)
+TIGHT_PERCENT = re.compile(r"(?<!:)\b\d+%(?!\d)")  # not the width of a style
 NOT_FOR_USERS = {"decisions", "api"}  # a record of its time; made from docstrings
 
 
@@ -114,3 +115,18 @@ def test_no_message_or_docstring_uses_another_name(words: str) -> None:
 
 def test_sets_are_named_by_their_kind() -> None:
     assert not sets_alone([*pages(), *strings()])
+
+
+def percent_formats(code: str) -> list[int]:
+    """Lines of the f-strings that format as Python does, without a space: ``{share:.0%}``."""
+    specs = (n.format_spec for n in ast.walk(ast.parse(code)) if isinstance(n, ast.FormattedValue) and n.format_spec)
+    return [spec.lineno for spec in specs if ast.unparse(spec).rstrip("'\"").endswith("%")]
+
+
+def test_percent_stands_after_a_space() -> None:
+    texts = [*pages(), *strings()]
+    assert [f"{place}: {match[0]!r}" for place, text in texts for match in TIGHT_PERCENT.finditer(text)] == []
+    assert percent_formats('f"{share:.0%} and {100 * share:.0f} %"') == [1]
+    for folder in (*PACKAGES, "docs/gallery"):
+        for path in (ROOT / folder).rglob("*.py"):
+            assert percent_formats(path.read_text()) == [], path

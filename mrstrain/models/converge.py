@@ -51,7 +51,7 @@ class Converged:
         lines = ["Cell sizes, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
         for row in self.rows:
             values, of = ", ".join(f"{v:.4g}" for v in row.values), row.limit
-            tends = f"limit {of.limit:.4g} (order {of.order:.1f}), error of the finest mesh {of.error:+.1%}"
+            tends = f"limit {of.limit:.4g} (order {of.order:.1f}), error of the finest mesh {100 * of.error:+.1f} %"
             tends = (
                 tends if np.isfinite(of.limit) else "no limit, because the values do not approach one; use finer meshes"
             )

@@ -175,12 +175,12 @@ def test_loads_that_models_did_not_carry_or_whose_laws_are_unstable_are_told(stu
         outcome = {"Load1": load1, "Load2": {"reached": 1.0, "stable_share": 1.0}}
         (study / model / "simulation.json").write_text(json.dumps({"outcome": outcome, "parameters": {}}))
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
-    assert "half reached only 42% of Load1; this load is not compared." in done.comparison.notes
+    assert "half reached only 42 % of Load1; this load is not compared." in done.comparison.notes
     assert [a.model for a in done.comparison.ranking.areas] == ["right"]
     assert [sorted(one.fields.models) for one in done.comparison.loads] == [["right"], ["half", "right"]]
     (told,) = [note for note in done.comparison.notes if "not stable (Drucker)" in note]
     assert told.startswith("right, Load1:")
-    assert "10.0%" in told
+    assert "10.0 %" in told
 
 
 def test_a_load_is_looked_at_along_its_own_directions(study: Path) -> None:
@@ -219,7 +219,7 @@ def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Pat
     for name, words in (
         ("a bit", "check its frame"),
         ("moving", "mm at the bone"),
-        ("swollen", "mean change of cell volume is 33%"),
+        ("swollen", "mean change of cell volume is 33 %"),
     ):
         assert any(name in note and words in note for note in done.comparison.notes), (name, done.comparison.notes)
 

@@ -106,7 +106,7 @@ def test_what_is_refused_leaves_an_earlier_comparison_whole(plain, study: Path) 
     for more, error, message in (
         ({"bones": ["calcaneus"]}, InputError, "no label 'calcaneus'"),
         ({"mesh": study / "nowhere.vtu"}, (InputError, ImageFileError), "nowhere.vtu"),
-        ({"mesh": aside}, GeometryError, "aside.vtu: only 50% of the model lies in the labelled soft tissue"),
+        ({"mesh": aside}, GeometryError, "aside.vtu: only 50 % of the model lies in the labelled soft tissue"),
         ({"mesh": far}, GeometryError, "far.vtu does not lie in the image"),
         ({}, ImageFileError, "displacement.nii.gz"),
     ):
