@@ -17,7 +17,6 @@ QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"")  # names as they were, in the changel
 CODE = re.compile(r"`[^`]*`|sets\s*=|(?:\[models\] |\{\{? ?|[-.\"'])sets\b")  # the name in code
 SETS = re.compile(r"(?<!material )(?<!surface )(?<!node )(?<!element )\bsets\b(?! of| up)", re.IGNORECASE)
 TIGHT_PERCENT = re.compile(r"(?<!:)\b\d+%(?!\d)")  # not the width of a style
-NOT_FOR_USERS = {"decisions", "api"}  # a record of its time; made from docstrings
 
 
 def entries() -> list[dict[str, str]]:
@@ -41,7 +40,7 @@ def forbidden() -> list[str]:
 def pages() -> list[tuple[str, str]]:
     folders = (ROOT / "docs", ROOT / "benchmarks")
     paths = [ROOT / "README.md", *(page for folder in folders for page in sorted(folder.rglob("*.md")))]
-    read = [path for path in paths if path != GLOSSARY and not NOT_FOR_USERS & set(path.parts)]
+    read = [path for path in paths if path != GLOSSARY]
     changelog = QUOTED.sub("", (ROOT / "CHANGELOG.md").read_text())
     return [("CHANGELOG.md", changelog), *((str(path.relative_to(ROOT)), path.read_text()) for path in read)]
 
