@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.report.chart import chart, colour_bar, empty, label_axes, legend
+from dvc.report.drawing import Columns
 from dvc.report.figures import MAX_SHEAR
 from dvc.report.sheet import letters, name_sides, scale_bar, slice_panel
 from dvc.report.style import FONT, GRID, INK, ON_LIGHT, RULE, TISSUES, WIDTH_IN, Look, looks
@@ -224,6 +225,16 @@ def force_displacement(states: Sequence[LoadState]) -> Figure:
         label_axes(axes, f"{name} displacement, mm", f"{name} force, N")
     legend(spots[0])
     return figure
+
+
+def forces(states: Sequence[LoadState]) -> Columns:
+    """The data of `force_displacement`: a row for each converged increment."""
+    steps = [(state.load.name, at) for state in states for at in state.curve]
+    columns: dict[str, list[object]] = {"load": [load for load, _ in steps]}
+    for axis, name in enumerate(("normal", "shear")):
+        columns[f"{name}_displacement_mm"] = [float(at.displacement_mm[axis]) for _, at in steps]
+        columns[f"{name}_force_n"] = [float(at.force_n[axis]) for _, at in steps]
+    return columns
 
 
 def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:

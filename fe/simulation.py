@@ -197,8 +197,7 @@ class Simulation:
             shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             (push, pull, _), (moved, along, _) = state.force_n, state.plate_displacement_mm
             force = f"{push:.1f} N normal, {pull:z.1f} N shear"
-            reached = f"{100 * state.reached:.0f} %"
-            part = "" if state.reached == 1.0 else f" ONLY {reached} of the load was reached ({force});"
+            part = "" if state.reached == 1 else f" ONLY {100 * state.reached:.0f} % of the load was reached ({force});"
             lines.append(
                 f"{self.name}, {state.load.name}:{part} plate displacement {moved:z.2f} mm normal, {along:z.2f} mm "
                 f"shear; max. shear, median / 90th percentile: {shear}"
@@ -287,7 +286,7 @@ class Simulation:
         content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
         write_json(place / RECORD, content | dict(record or {"parameters": parameters}))
         save_figure(place / "slices", self.plot())
-        save_figure(place / "force_displacement", figures.force_displacement(self.states))
+        save_figure(place / "force_displacement", figures.force_displacement(self.states), figures.forces(self.states))
 
     def write_decks(self, folder: Path | str) -> None:
         """Write input files of each load with quadratic tetrahedra: ``LOAD.inp`` (CalculiX), ``LOAD.feb`` (FEBio 4).
