@@ -195,7 +195,10 @@ def error_tables(bars: ErrorBars) -> list[Table]:
     return tables
 
 
-def _claimed(row: Judged) -> tuple[str, str, float]:
+def _claimed(row: Judged) -> tuple[Cell, ...]:
+    """Cells on what the error bars claim of a region; none without error bars."""
+    if row.held is None or row.expected is None:
+        return ()
     return f"{100 * row.held:.0f} %", f"{100 * row.expected:.0f} %", row.factor
 
 

@@ -209,7 +209,7 @@ def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Pat
 
     u = sheared(0.4).displacement(mesh.points_mm)
     off = written("off", mesh.points_mm - [6.0, 0.0, 0.0], u)  # a third of it in the bone
-    with pytest.raises(GeometryError, match=r"only \d+% of the model lies in the labelled soft tissue"):
+    with pytest.raises(GeometryError, match=r"only \d+ % of the model lies in the labelled soft tissue"):
         compare(study / "measured", [off], **given(study))
     assert not (study / "out").exists()
     a_bit = written("a bit", mesh.points_mm - [2.0, 0.0, 0.0], u)

@@ -148,7 +148,7 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     done = CliRunner().invoke(app, ["simulate", str(mesh_file), "--set", "luboz", *loads, *PLATE, "--out", str(out)])
     said = " ".join(done.output.split())
     assert done.exit_code == 1, said
-    assert re.search(r"luboz, b: ONLY \d+% of the load was reached", said)
+    assert re.search(r"luboz, b: ONLY \d+ % of the load was reached", said)
     assert "luboz: c was not tried" in said
     assert re.search(r"b: no equilibrium was found beyond \d+ % of the load, .*\(lowest det F 0\.\d+\)", said)
     told = json.loads((out / "luboz" / "simulation.json").read_text())["outcome"]
