@@ -242,3 +242,11 @@ def test_what_is_of_another_kind_is_refused_with_what_to_give(argument: int, giv
     arguments[argument] = given
     with pytest.raises(InputError, match=said):
         fe.simulate(*arguments)  # type: ignore[arg-type]
+
+
+def test_a_new_simulation_removes_the_figures_of_an_older_version_too(tmp_path: Path) -> None:
+    old, foreign = tmp_path / "force_travel.png", tmp_path / "notes.csv"
+    for path in (old, tmp_path / "force_displacement.csv", foreign):
+        path.touch()
+    fe.begin_simulation(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.csv", "simulation.json"]
