@@ -123,9 +123,9 @@ oldest newest:
 clean-install: setup
 	$(BIN)/python -m tests.clean_install
 
-# What proselint reads: not decisions and the record of the benchmarks, which are of their time. Its checks of typography,
-# of words said twice and of spelling variants take code and formulas for prose, and are off.
-PROSE := README.md CHANGELOG.md $(wildcard docs/*.md) docs/tutorials docs/python docs/reference docs/benchmarks
+# What proselint reads. Its checks of typography, of words said twice and of spelling variants take code and formulas for
+# prose, and are off.
+PROSE := README.md CHANGELOG.md docs benchmarks
 
 docs: .venv-docs/installed.stamp
 	.venv-docs/$(notdir $(BIN))/proselint check --config docs/proselint.json $(PROSE)

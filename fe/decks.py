@@ -217,7 +217,7 @@ def _febio_law(region: str, law: Material) -> tuple[str, dict[str, str]]:
 def _about(state: LoadState) -> tuple[str, ...]:
     force = ", ".join(f"{f:.4g}" for f in state.force_n)
     return (
-        f"Written by mrstrain: state at {state.reached:.0%} of {state.load.name}. Units mm, N, MPa; frame LPS.",
+        f"Written by mrstrain: state at {100 * state.reached:.0f} % of {state.load.name}. Units mm, N, MPa; frame LPS.",
         "Bone is fixed; nodes on the plate are moved to their final positions. There is no contact and no force.",
         f"Expected plate force along the normal force, the shear and their cross product: {force} N.",
         "Small deviations come from the element type, which differs from that of the simulation.",

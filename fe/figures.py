@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.report.chart import chart, colour_bar, empty, label_axes, legend
+from dvc.report.drawing import Columns
 from dvc.report.figures import MAX_SHEAR
 from dvc.report.sheet import letters, name_sides, scale_bar, slice_panel
 from dvc.report.style import FONT, GRID, INK, ON_LIGHT, RULE, TISSUES, WIDTH_IN, Look, looks
@@ -76,7 +77,8 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
     assert axes is not None
     fields, middle = [], _lowest_bone_point(mesh, axes)
     for state in states:
-        title = f"{state.load.name}: {state.load}{'' if state.reached == 1.0 else f' (ONLY {state.reached:.0%})'}"
+        part = "" if state.reached == 1.0 else f" (ONLY {100 * state.reached:.0f} %)"
+        title = f"{state.load.name}: {state.load}{part}"
         fields.append(Slice(title, state.u_mm, state.strain.max_shear, _along_plate(mesh, state, axes, middle)))
     return slice_sheet(mesh, fields, axes, middle)
 
@@ -224,6 +226,16 @@ def force_displacement(states: Sequence[LoadState]) -> Figure:
         label_axes(axes, f"{name} displacement, mm", f"{name} force, N")
     legend(spots[0])
     return figure
+
+
+def forces(states: Sequence[LoadState]) -> Columns:
+    """The data of `force_displacement`: a row for each converged increment."""
+    steps = [(state.load.name, at) for state in states for at in state.curve]
+    columns: dict[str, list[object]] = {"load": [load for load, _ in steps]}
+    for axis, name in enumerate(("normal", "shear")):
+        columns[f"{name}_displacement_mm"] = [float(at.displacement_mm[axis]) for _, at in steps]
+        columns[f"{name}_force_n"] = [float(at.force_n[axis]) for _, at in steps]
+    return columns
 
 
 def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:

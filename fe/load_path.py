@@ -136,7 +136,7 @@ class LoadPath:
             if self.plate.displacement_mm[0] < least_mm:
                 break
             left, step = least, step * _GROWTH
-            self._log(f"{1.0 - left:.0%} released")
+            self._log(f"{100 * (1.0 - left):.0f} % released")
         if left > 0.0:
             self._back(level)
         return left == 0.0
@@ -171,7 +171,7 @@ class LoadPath:
             share = min(1.0, done + step)
             if self._go(target.displaced, before + share * way, downhill=downhill):
                 done, step = share, step if downhill else step * _GROWTH
-                self._log(f"{done:.0%} of this stage")
+                self._log(f"{100 * done:.0f} % of this stage")
                 self.on_converged()
                 continue
             step *= _SHRINK

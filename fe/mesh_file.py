@@ -65,8 +65,8 @@ def write_tet_mesh(
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
     """Read a tetrahedral mesh with its named regions and surface sets, made by mrstrain or another program.
 
-    A JSON file of the same name may name the numbers in the array ``region``. A set of all cells is ignored if other
-    sets contain every cell, and so are the materials of ANSYS if its components do. The surface sets "bone", "skin" and
+    A JSON file of the same name may name the numbers in the array ``region``. A set of all cells is ignored if others
+    contain every cell, and so are the materials of ANSYS if its components do. The surface sets "bone", "skin" and
     "cut" are recognised in upper or lower case (ANSYS writes capitals only).
 
     Raises

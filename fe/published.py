@@ -21,7 +21,7 @@ from fe.materials import MODES, Hencky, Material, Materials, NeoHooke, Ogden, Ye
 WHOLE = "all"
 """Name of the tissue in a set that has one constitutive model for all tissues."""
 
-_FAR, _ODD = 10.0, 1000.0  # times the range of the published sets: for their tissues, and for any other
+_FAR, _ODD = 10.0, 1000.0  # times the range of the published material sets: for their tissues, and for any other
 _UNITS = {1e-3: " Are its parameters in kPa, entered as MPa?", 1e3: " Are they in MPa, entered as kPa?"}
 _ALIKE = 0.8, 1.25  # times a published model of all tissues, which may be that of a tissue
 _USED = 0.7, 1.4  # stretches of tissue under a plate
@@ -155,7 +155,7 @@ def _odd_stiffness(name: str, materials: Materials) -> list[str]:
 
 
 def _published_mpa(tissue: str) -> tuple[float, float, bool]:
-    """Least and largest shear modulus of a tissue in the published sets, and whether one names it.
+    """Least and largest shear modulus of a tissue in the published material sets, and whether one names it.
 
     That of all tissues as one may be that of any; a tissue that no set names may be as any.
     """

@@ -118,12 +118,12 @@ class Simulation:
         reached = {state.load.name for state in self.states}
         notes = [
             f"{row.load}: the material of {row.region} violates Drucker stability in "
-            f"{100.0 * (1.0 - row.stable_share):.1f} % of its volume; do not trust strain there. Use another material "
+            f"{100 * (1.0 - row.stable_share):.1f} % of its volume; do not trust strain there. Use another material "
             "set or a smaller load."
             for row in self._unstable
         ]
         notes += [
-            f"{row.load}: {100.0 * row.crowded_share:.1f} % of {row.region} is compressed below det F {CROWDED:g}. "
+            f"{row.load}: {100 * row.crowded_share:.1f} % of {row.region} is compressed below det F {CROWDED:g}. "
             "There, the solver adds an artificial stiffness, because this material cannot carry a pressure above its "
             f"bulk modulus ({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa). Do not interpret strain "
             "in these cells; use a higher Poisson's ratio or a lower load."
@@ -132,7 +132,7 @@ class Simulation:
         ]
         for state in self.states:
             if state.out_of_time:
-                began = f"at {state.reached:.0%} of the load; a run with a longer limit continues from there"
+                began = f"at {100 * state.reached:.0f} % of the load; a run with a longer limit continues from there"
                 when = began if len(state.curve) > 1 else "before the first equilibrium"
                 notes.append(f"{state.load.name}: the time limit was reached {when}.")
         notes += [
@@ -146,7 +146,7 @@ class Simulation:
             if load.name not in reached
         ]
         notes += [
-            f"{state.load.name}: in {100.0 * share:.0f} % of the volume, the volume ratio of the mesh deviates by more "
+            f"{state.load.name}: in {100 * share:.0f} % of the volume, the volume ratio of the mesh deviates by more "
             "than 5 % from the one that the pressure and the bulk modulus give. A finer mesh reduces this error."
             for state in self.states
             if (share := self._share_off(state)) > _MUCH
@@ -187,7 +187,7 @@ class Simulation:
         for state in self.states:
             moved, along, _ = state.plate_displacement_mm
             sheared = f" (along the shear {along:z.1f})" if state.load.sheared else ""
-            part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%} of the load)"
+            part = "" if state.reached == 1.0 else f" (ONLY {100 * state.reached:.0f} % of the load)"
             plates.append(f"{state.load.name} {moved:z.1f}{sheared}{part}")
         return f"plate displacement, mm: {', '.join(plates)}"
 
@@ -197,7 +197,7 @@ class Simulation:
             shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             (push, pull, _), (moved, along, _) = state.force_n, state.plate_displacement_mm
             force = f"{push:.1f} N normal, {pull:z.1f} N shear"
-            part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
+            part = "" if state.reached == 1 else f" ONLY {100 * state.reached:.0f} % of the load was reached ({force});"
             lines.append(
                 f"{self.name}, {state.load.name}:{part} plate displacement {moved:z.2f} mm normal, {along:z.2f} mm "
                 f"shear; max. shear, median / 90th percentile: {shear}"
@@ -219,7 +219,7 @@ class Simulation:
         for state in self.states:
             plate = (round(float(v), 2) for v in (*state.plate_displacement_mm[:2], *state.force_n[:2]))
             shear = (f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
-            rows.append((state.load.name, str(state.load), f"{state.reached:.0%}", *plate, *shear))
+            rows.append((state.load.name, str(state.load), f"{100 * state.reached:.0f} %", *plate, *shear))
         head = (
             "load", "target", "reached", "normal displacement, mm", "shear displacement, mm", "normal force, N",
             "shear force, N",
@@ -286,7 +286,7 @@ class Simulation:
         content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
         write_json(place / RECORD, content | dict(record or {"parameters": parameters}))
         save_figure(place / "slices", self.plot())
-        save_figure(place / "force_travel", figures.force_displacement(self.states))
+        save_figure(place / "force_displacement", figures.force_displacement(self.states), figures.forces(self.states))
 
     def write_decks(self, folder: Path | str) -> None:
         """Write input files of each load with quadratic tetrahedra: ``LOAD.inp`` (CalculiX), ``LOAD.feb`` (FEBio 4).

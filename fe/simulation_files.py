@@ -27,7 +27,8 @@ from fe.solution import LoadState
 
 RECORD = "simulation.json"
 ENDING = ".restart.npz"
-_TABLES = ("regions.csv", "curve.csv", "slices.png", "slices.pdf", "force_travel.png", "force_travel.pdf")
+_FIGURES = "slices", "force_displacement", "force_travel"  # the last: its name before
+_TABLES = ("regions.csv", "curve.csv", *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf", "csv")))
 _CONTACT = [field.name for field in fields(ContactStatus)]
 _PLATE = [field.name for field in fields(PlateState)]
 

@@ -121,7 +121,8 @@ def _shown(tissue: Mask, motion: Deformation, grid: Grid) -> float:
     points = tissue.points()
     known: BoolArray = np.all(np.isfinite(H), axis=(1, 2)) & np.all(np.isfinite(u), axis=1)
     if np.count_nonzero(known) < 0.5 * len(known):
-        raise InputError(f"The deformation is defined in only {known.mean():.0%} of the tissue; 50% is needed.")
+        share = f"{100 * known.mean():.0f} %"
+        raise InputError(f"The deformation is defined in only {share} of the tissue; 50 % is needed.")
     folded = np.flatnonzero(known)[np.linalg.det(H[known] + np.eye(3)) <= 0.0]
     if len(folded):
         at = points[folded[0]]
@@ -133,8 +134,8 @@ def _shown(tissue: Mask, motion: Deformation, grid: Grid) -> float:
     shown = np.count_nonzero(grid.contains(moved[np.isfinite(moved).all(axis=1)])) / len(points)
     if shown < 0.5:
         raise InputError(
-            f"The deformation moves {1 - shown:.0%} of the tissue out of the field of view, or is not defined there. "
-            "Pass a deformation of this image that includes the bone motion, or a smaller tissue mask."
+            f"The deformation moves {100 * (1 - shown):.0f} % of the tissue out of the field of view, or is not "
+            "defined there. Pass a deformation of this image that includes the bone motion, or a smaller tissue mask."
         )
     return shown
 

@@ -166,7 +166,7 @@ REFUSED: list[tuple[int, Give, str, str, str]] = [  # row, what is given, and th
     (3, lambda folder: read_mask(nifti(folder / "a.nii", 0 * VALUES)), "a.nii", "the mask is empty", "Choose another"),
     (3, lambda folder: read_mask(nifti(folder / "a.nii", np.round(VALUES / 60.0))), "a.nii",
      "a mask must have zeros and one other value", "save one region as a mask"),
-    (6, mask_elsewhere, "bone.nii", "0% of its volume is inside the image", "drawn on another image"),
+    (6, mask_elsewhere, "bone.nii", "0 % of its volume is inside the image", "drawn on another image"),
     (7, orientations_that_disagree, "a.nii", "qform and sform differ", "Set the code of the wrong one to 0"),
     (7, sheared, "a.nii", "the affine is sheared", "Resample the image"),
     (8, lambda folder: read_image(nifti(folder / "a.nii", 0 * VALUES + 3)), "a.nii", "constant (all voxels are 3)",

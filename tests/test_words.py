@@ -14,7 +14,9 @@ ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = ROOT / "docs" / "glossary.md"
 PACKAGES = ("dvc", "fe", "validate", "phantoms", "mrstrain")
 QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"")  # names as they were, in the changelog
-NOT_FOR_USERS = {"decisions", "api"}  # a record of its time; made from docstrings
+CODE = re.compile(r"`[^`]*`|sets\s*=|(?:\[models\] |\{\{? ?|[-.\"'])sets\b")  # the name in code
+SETS = re.compile(r"(?<!material )(?<!surface )(?<!node )(?<!element )\bsets\b(?! of| up)", re.IGNORECASE)
+TIGHT_PERCENT = re.compile(r"(?<!:)\b\d+%(?!\d)")  # not the width of a style
 
 
 def entries() -> list[dict[str, str]]:
@@ -38,7 +40,7 @@ def forbidden() -> list[str]:
 def pages() -> list[tuple[str, str]]:
     folders = (ROOT / "docs", ROOT / "benchmarks")
     paths = [ROOT / "README.md", *(page for folder in folders for page in sorted(folder.rglob("*.md")))]
-    read = [path for path in paths if path != GLOSSARY and not NOT_FOR_USERS & set(path.parts)]
+    read = [path for path in paths if path != GLOSSARY]
     changelog = QUOTED.sub("", (ROOT / "CHANGELOG.md").read_text())
     return [("CHANGELOG.md", changelog), *((str(path.relative_to(ROOT)), path.read_text()) for path in read)]
 
@@ -63,11 +65,21 @@ def found(words: str, texts: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{place}: {match[0]!r}" for place, text in texts for match in pattern.finditer(text)]
 
 
+def sets_alone(texts: Iterable[tuple[str, str]]) -> list[str]:
+    """Where "sets" stands without the word that says of what: material, surface, node, element, or "sets of"."""
+    prose = [(place, " ".join(CODE.sub("", text).split())) for place, text in texts if text != "sets"]
+    return [
+        f"{place}: {text[max(at.start() - 30, 0) : at.end()]!r}" for place, text in prose for at in SETS.finditer(text)
+    ]
+
+
 def test_the_glossary_has_its_forbidden_twins() -> None:
     assert {"shading", "told apart", "maximal shear"} <= set(forbidden())
     assert {"confidence interval", "how accurate", "how sure", "error margin"} <= set(forbidden())
     assert found("told apart", [("here", "A is told\n    apart from B")]) == ["here: 'told\\n    apart'"]
     assert not found("travel", [("here", "travelling")])
+    assert len(sets_alone([("here", "The published sets, of\nwhich three sets need care; all sets")])) == 3
+    assert not sets_alone([("here", "material\n  sets and surface sets, `sets`, sets = [], a.sets; sets of nodes")])
 
 
 def test_terms_of_measurement_quality_are_those_of_the_vim_and_say_where_they_are_used() -> None:
@@ -98,3 +110,22 @@ def test_no_page_uses_another_name(words: str) -> None:
 @pytest.mark.parametrize("words", forbidden())
 def test_no_message_or_docstring_uses_another_name(words: str) -> None:
     assert not found(words, strings())
+
+
+def test_sets_are_named_by_their_kind() -> None:
+    assert not sets_alone([*pages(), *strings()])
+
+
+def percent_formats(code: str) -> list[int]:
+    """Lines of the f-strings that format as Python does, without a space: ``{share:.0%}``."""
+    specs = (n.format_spec for n in ast.walk(ast.parse(code)) if isinstance(n, ast.FormattedValue) and n.format_spec)
+    return [spec.lineno for spec in specs if ast.unparse(spec).rstrip("'\"").endswith("%")]
+
+
+def test_percent_stands_after_a_space() -> None:
+    texts = [*pages(), *strings()]
+    assert [f"{place}: {match[0]!r}" for place, text in texts for match in TIGHT_PERCENT.finditer(text)] == []
+    assert percent_formats('f"{share:.0%} and {100 * share:.0f} %"') == [1]
+    for folder in (*PACKAGES, "docs/gallery"):
+        for path in (ROOT / folder).rglob("*.py"):
+            assert percent_formats(path.read_text()) == [], path

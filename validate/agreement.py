@@ -104,7 +104,7 @@ def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
 
 @dataclass(frozen=True, slots=True)
 class SkinDisplacement:
-    """Displacement of the skin under the plate, and volume change of the fat; a row of travel.csv.
+    """Displacement of the skin under the plate, and volume change of the fat; a row of skin_displacement.csv.
 
     Attributes
     ----------

@@ -139,7 +139,7 @@ class Comparison:
         worse = ", no better than a model without deformation" if no_nearer([best], nothing[best.load]) else ""
         return (
             f"{best.model}: area between strain-volume curves {shown(best)} mL ({best.load}), normalised "
-            f"{best.share:.1%}{worse}."
+            f"{100 * best.share:.1f} %{worse}."
         )
 
     def plot(self, kind: Literal["curves", "areas"] = "curves", *, tissue: str = ALL) -> Figure:
@@ -368,8 +368,8 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
             what = "the error model is from one motion of one subject, so the coverage of its intervals is unknown."
             notes.append(f"{load}: {what}")
         notes += [
-            f"{load}: {name} covers only {volumes[name] / volumes['mesh']:.0%} of the mesh. All models are compared on "
-            "the tissue that every model covers."
+            f"{load}: {name} covers only {100 * volumes[name] / volumes['mesh']:.0f} % of the mesh. All models are "
+            "compared on the tissue that every model covers."
             for name in one.fields.models
             if volumes[name] < _COVERED * volumes["mesh"]
         ]

@@ -29,7 +29,7 @@ _MAX_SHEAR = "maximum shear strain, no unit"
 
 
 def model_looks(models: Iterable[str]) -> dict[str, Look]:
-    """A look for each model: the published sets have theirs in every figure; a levelled model is dotted."""
+    """A look for each model: the published material sets have theirs in every figure; a levelled model is dotted."""
     names = list(models)
     sets = [name for name in published_names() if not name.endswith("-as-published")]
     plain = looks((name.removesuffix(LEVELLED) for name in names), sets)

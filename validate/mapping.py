@@ -15,7 +15,8 @@ from dvc.trust.regions import volume_above
 ALL = "all soft tissue"
 """Name of all compared tissues together."""
 
-_OTHER = "unnamed"  # tissue of cells that are named neither by the mesh nor by the label map
+UNNAMED = "unnamed"
+"""Tissue of cells that are named neither by the mesh nor by the label map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +169,7 @@ def map_fields(
 def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.ndarray:
     """Tissue of each cell (m,) str: its region, if that is the name of a label; otherwise the label at its centroid."""
     names = set(labels.names.values())
-    tissue = np.full(len(mesh.cells), _OTHER, dtype=f"<U{max(len(n) for n in (*names, _OTHER))}")
+    tissue = np.full(len(mesh.cells), UNNAMED, dtype=f"<U{max(len(n) for n in (*names, UNNAMED))}")
     nearest = np.rint(labels.grid.indices_of(mesh.centroids_mm)).astype(np.int64)
     inside = ((nearest >= 0) & (nearest < np.array(labels.grid.shape))).all(axis=1)
     number = np.zeros(len(mesh.cells), dtype=np.int64)

@@ -108,7 +108,7 @@ def simulate_driven(
                 continue
             state, done, step = converged.state, share, step * _GROWTH
             iterations += converged.iterations
-            tell(f"{done:.0%} of the displacement")
+            tell(f"{100 * done:.0f} % of the displacement")
     finally:
         solver.close()
     if done == 0.0:

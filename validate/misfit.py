@@ -111,7 +111,7 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
         there = labels.grid.points(labelled)
         own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
-            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: {own}; tissue: "
+            f"{path}: only {100 * overlap:.0f} % of the model lies in the labelled soft tissue. Model: {own}; tissue: "
             f"{of_tissue} (LPS mm). Check that both are of one subject, and the model's unit and frame; or give the "
             "rigid map to the image (to_image)."
         )
@@ -134,15 +134,15 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
         )
     overlap = check_in_tissue(result.path, mesh, labels, bones)
     if overlap < _GOOD_OVERLAP:
-        warnings.append(f"only {overlap:.0%} of the model lies in the labelled soft tissue; check its frame.")
+        warnings.append(f"only {100 * overlap:.0f} % of the model lies in the labelled soft tissue; check its frame.")
     names = [name for name in labels.names.values() if name not in bones]
     tissue, of_mesh = (tissues_of(mesh, labels, by_mesh=by_mesh) for by_mesh in (False, True))
     both, volume = np.isin(tissue, names) & np.isin(of_mesh, names), mesh.volumes_mm3
     same = float(volume[both & (of_mesh == tissue)].sum() / max(volume[both].sum(), 1e-12))
     if both.any() and same < _SAME_TISSUE:
         warnings.append(
-            f"model and label map have the same tissue name in only {same:.0%} of the volume; check the names, and the "
-            "frame of the model."
+            f"model and label map have the same tissue name in only {100 * same:.0f} % of the volume; check the names, "
+            "and the frame of the model."
         )
     of_bone = bone or _points_of_bone(labels, bones)
     distance = of_bone.query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0]
@@ -162,7 +162,7 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
     change = float(volume @ np.abs(determinant - 1.0) / volume.sum())
     if change > _VOLUME_CHANGE:
         warnings.append(
-            f"the mean change of cell volume is {change:.0%}, which is implausible for soft tissue; check that "
+            f"the mean change of cell volume is {100 * change:.0f} %, which is implausible for soft tissue; check that "
             "displacements have the frame and unit of the coordinates, which must be unloaded."
         )
     levels: dict[Level, list[str]] = {"distrust": wrong, "caution": warnings}

@@ -21,11 +21,11 @@ from validate.curves import Area
 from validate.fe_result import FeResult
 from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
-from validate.mapping import ALL, filled_from_nearest
+from validate.mapping import ALL, UNNAMED, filled_from_nearest
 from validate.misfit import Misfit
 from validate.ranking import ALL_LOADS, Ranking, no_nearer
 from validate.strip import strip_of
-from validate.tables import Curve
+from validate.tables import Curve, columns_of, curves_of
 
 _AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
 _DIFFERENCES = (  # stem of the files, quantity, its name with its unit in the columns, title
@@ -71,7 +71,7 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
     measured, results = one.case.read()
     fields, axes = one.fields, one.case.axes
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
-    tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
+    tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)][:_PANELS]
     middle = fields.mesh.bounds_mm.mean(axis=0)
     lowest = lowest_bone_point(one.labels, one.bones[0], axes) if one.bones else middle
     point, through = lowest, f"The slice goes through {_place(one)}."
@@ -81,7 +81,10 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
     slices = one, measured, displacements, point
     agreement = figures.agreement_bins(fields)
     drawings = {
-        "curves": Drawing.of("Strain-volume curves", figures.volume_strain, one, tissues[:_PANELS], models),
+        "curves": Drawing.of(
+            "Strain-volume curves", figures.volume_strain, one, tissues, models,
+            data=columns_of(curve for curve in curves_of(one) if curve.tissue in tissues),
+        ),
         "slices": Drawing.of("Location of the strain", figures.slices, *slices, note=through),
         "agreement": Drawing.of(
             "Maximum shear strain, cell by cell", figures.scatter, agreement,
@@ -177,8 +180,10 @@ def drawings_of_all(
     slices, of_all = (strips, (MEASURED, model)), [curve for curve in curves if curve.tissue == ALL]
     return {
         "slices_by_load": Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note),
-        "curves_by_load": Drawing.of("Strain-volume curves, all soft tissue", figures.curves_by_load, of_all, strains),
-    }
+        "curves_by_load": Drawing.of(
+            "Strain-volume curves, all soft tissue", figures.curves_by_load, of_all, strains, data=columns_of(of_all)
+        ),
+    }  # fmt: skip
 
 
 def overview(
@@ -264,7 +269,9 @@ def _tissues(one: LoadComparison) -> Table:
         "As measured: with the noise and smoothing of the measurement. Estimate and interval: corrected for both by "
         "the error model. Perfect model: the area that noise alone would cause; an interval whose lower end is smaller "
         "begins at 0, because a perfect model is not excluded. Areas of tissues do not add up to that of all soft "
-        "tissue, in which over- and underestimates cancel.",
+        "tissue, in which over- and underestimates cancel."
+        + f" {UNNAMED}: tissue of the mesh that has no name of the label map and lies outside all its labels."
+        * any(a.tissue == UNNAMED for a in one.areas),
         cells(a for a in one.areas if a.model == NOTHING),
     )  # fmt: skip
 

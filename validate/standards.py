@@ -28,7 +28,7 @@ def drawing(one: LoadComparison, models: Sequence[str]) -> Drawing | None:
 def coefficients(decompositions: Mapping[str, Decomposition], models: Sequence[str]) -> Figure:
     """Coefficients of the maximum shear strain in each tissue: simulated over measured, bias removed.
 
-    On the line both are equal. The grey band has the width that CWA 16799 gives to all coefficients, 2 u(s). Bars are
+    On the line both are equal. The grey band has the width that CWA 16799 gives to all coefficients. Bars are
     the expanded uncertainty of each measured coefficient: a model represents those whose bar reaches the line.
     """
     tissues = list(decompositions)[:_PANELS]
@@ -40,7 +40,7 @@ def coefficients(decompositions: Mapping[str, Decomposition], models: Sequence[s
         shown = np.concatenate([by.estimate, *of_models.values()])
         line = np.array([shown.min() - by.guide_band, shown.max() + by.guide_band])
         edges = line - by.guide_band, line + by.guide_band
-        axes.fill_between(line, *edges, **BAND, label="CWA 16799, 2 u(s)")
+        axes.fill_between(line, *edges, **BAND, label="band of CWA 16799")
         axes.plot(line, line, color=INK, linewidth=0.9)
         for name, values in of_models.items():
             colour = look[name].colour

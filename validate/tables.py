@@ -16,7 +16,7 @@ from dvc.atomic_files import whole_file, write_csv
 from dvc.errors import InputError
 from dvc.file_names import as_file_name
 from dvc.own_files import read_json, read_rows
-from dvc.report.drawing import figure_files
+from dvc.report.drawing import Columns, figure_files
 from validate.agreement import Agreement, SkinDisplacement
 from validate.comparison_error import ComparisonError
 from validate.curves import Area
@@ -28,17 +28,18 @@ from validate.mavm import ModelForm
 
 RECORD = "comparison.json"
 TABLES = {
-    "areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement,
-    "decomposition.csv": Representation, "mavm.csv": ModelForm,
+    "areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement,
+    "skin_displacement.csv": SkinDisplacement, "decomposition.csv": Representation, "mavm.csv": ModelForm,
     "comparison_error.csv": ComparisonError,
 }  # fmt: skip
 _LATER = (Representation, ModelForm, ComparisonError)  # older comparisons have no such table
+_BEFORE = {"skin_displacement.csv": "travel.csv"}  # names in older comparisons
 CURVES = "curves.csv"
 OF_ALL_LOADS = ("slices_by_load", "curves_by_load")
 """Stems of the figures under all loads."""
 LOWER, UPPER = "measured, low", "measured, high"
 """Names of the curves that bound the 95 % band of the true curve."""
-_CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml", "verdict")
+_CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml")
 _STEP = 0.005  # of strain, in written curves
 
 
@@ -79,24 +80,34 @@ def write_tables(
     for (name, kind), rows in zip(TABLES.items(), tables, strict=True):
         head = [*(f.name for f in fields(kind)), "verdict"]
         write_csv(folder / name, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
-    points = (
-        (c.load, c.tissue, c.field, strain, volume, verdicts.get(c.load, ""))
+    points = columns_of(curves)
+    verdict = (verdicts.get(str(load), "") for load in points["load"])
+    write_csv(folder / CURVES, [*points, "verdict"], zip(*points.values(), verdict, strict=True))
+
+
+def columns_of(curves: Iterable[Curve]) -> Columns:
+    """The points of curves one below the other; also the data of figures that show them."""
+    points = [
+        (c.load, c.tissue, c.field, strain, volume)
         for c in curves
         for strain, volume in zip(c.max_shear.tolist(), c.volume_above_ml.tolist(), strict=True)
-    )
-    write_csv(folder / CURVES, _CURVE_COLUMNS, points)
+    ]
+    return dict(zip(_CURVE_COLUMNS, zip(*points, strict=True), strict=True))
 
 
 def read_tables(folder: Path) -> list[tuple[Any, ...]]:
     """Rows of each of the `TABLES`, to the six digits of the file; InputError if a file is not such a table."""
     tables: list[tuple[Any, ...]] = []
     for name, kind in TABLES.items():
+        path = folder / name
+        if name in _BEFORE and not path.is_file():
+            path = folder / _BEFORE[name]
         readers = get_type_hints(kind)  # int, float or str
-        if kind in _LATER and not (folder / name).is_file():
+        if kind in _LATER and not path.is_file():
             tables.append(())
             continue
-        rows = _rows(folder / name, readers)
-        with _damage_named(folder / name):
+        rows = _rows(path, readers)
+        with _damage_named(path):
             tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))
     return tables
 
@@ -139,8 +150,8 @@ def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
         earlier = [as_file_name(load) for load in read_json(folder / RECORD)["coverage_ml"]]
     except (OSError, ValueError, KeyError, TypeError):
         return
-    pictures = (path for stem in OF_ALL_LOADS for path in figure_files(folder / stem))
-    for path in (*(folder / name for name in (*TABLES, CURVES, RECORD, "report.html")), *pictures):
+    pictures = (path for stem in OF_ALL_LOADS for path in (*figure_files(folder / stem), folder / f"{stem}.csv"))
+    for path in (*(folder / name for name in (*TABLES, *_BEFORE.values(), CURVES, RECORD, "report.html")), *pictures):
         path.unlink(missing_ok=True)
     for load in earlier:
         if load not in loads and (folder / load / "fields.vtu").is_file():

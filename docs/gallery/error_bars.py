@@ -17,7 +17,7 @@ fat = labels.region("fat").inside & np.isfinite(measured.sigma)
 true = dvc.strain_maps(motion, dvc.Mask(grid, fat)).max_shear
 error = (measured.max_shear - true)[fat] / measured.sigma[fat]
 held = np.mean(np.abs(error) < 1.96)
-print(f"{held:.0%} of the voxels of fat lie within 1.96 standard uncertainties")
+print(f"{100 * held:.0f} % of the voxels of fat lie within 1.96 standard uncertainties")
 assert held > 0.85
 
 plt.style.use(dvc.FIGURE_STYLE)

@@ -136,8 +136,8 @@ def _sampled(labels: LabelMap, total: Deformation, grid: Grid, body: Mask) -> Ca
     there = map_coordinates((labels.labels > 0).astype(np.float32), at, order=1, mode="nearest") > 0.5
     if (covered := float(np.mean(there))) < _LEAST_COVERED:
         raise RegistrationError(
-            f"The other subject's labels cover {covered:.0%} of the body after the registration. Check that both "
-            "images show the same part and side of the body; if not, mirror or choose another subject."
+            f"The other subject's labels cover {100 * covered:.0f} % of the body after the registration. Check that "
+            "both images show the same part and side of the body; if not, mirror or choose another subject."
         )
     depth = np.stack(
         [map_coordinates(depth_mm(labels.labels == n, spacing), at, order=1, mode="nearest") for n in numbers]

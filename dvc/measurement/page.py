@@ -19,6 +19,7 @@ from dvc.report.sheet import View
 from dvc.trust.components import ComponentUncertainty
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
+from dvc.trust.twin_judgement import Judged
 from dvc.trust.uncertainty import Interval
 
 STRAIN = "Maximum shear strain"
@@ -183,10 +184,16 @@ def error_tables(bars: ErrorBars) -> list[Table]:
         claims = bars.uncertainty is not None
         claimed = ("voxels within the claimed error", "expected at least", "intervals widened, times")
         head = ("region", "error (rms)", "bias", *(claimed * claims))
-        beside = ((f"{row.held:.0%}", f"{row.expected:.0%}", row.factor) if claims else () for row in bars.twin)
-        lines = tuple((row.region, row.rms_error, row.bias, *more) for row, more in zip(bars.twin, beside, strict=True))
+        lines = tuple((row.region, row.rms_error, row.bias, *(_claimed(row) if claims else ())) for row in bars.twin)
         tables.append(Table("Check by a synthetic warp of this pair (twin)", head, lines, _TWIN))
     return tables
+
+
+def _claimed(row: Judged) -> tuple[Cell, ...]:
+    """Cells on what the error bars claim of a region; none without error bars."""
+    if row.held is None or row.expected is None:
+        return ()
+    return f"{100 * row.held:.0f} %", f"{100 * row.expected:.0f} %", row.factor
 
 
 def _component_table(known: ComponentUncertainty) -> Table:

@@ -276,8 +276,8 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
             raise InputError(f"The {name} is empty: all voxels are 0. Choose another file.")
     if bone is not None and (share := float(np.mean(bone.inside[body.inside]))) > _MOSTLY_BONE:
         raise InputError(
-            f"The bone mask covers {share:.0%} of the body, so there is no soft tissue to measure. Check that bone "
-            "(--bone) is the mask of the bone, and not that of the body or of the whole image."
+            f"The bone mask covers {100 * share:.0f} % of the body, so there is no soft tissue to measure. Check that "
+            "bone (--bone) is the mask of the bone, and not that of the body or of the whole image."
         )
 
 

@@ -293,7 +293,7 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
             continue
         (at, above), missing = curves[name], float(np.isnan(max_shear[labels.labels == label]).mean())
         told = name.replace("$", r"\$")  # a dollar would start a formula
-        told += "" if missing < 0.0005 else f" ({missing:.1%} without a result)"
+        told += "" if missing < 0.0005 else f" ({100 * missing:.1f} % without a result)"
         for axes, shown in zip(panels, (above, np.where(above > 0, above, np.nan)), strict=True):
             axes.step(at, shown, where="post", label=told, **look[name].line)
     panels[1].set_yscale("log")

@@ -104,7 +104,7 @@ def target_registration_error(
     Raises
     ------
     InputError
-        If the two sets do not have the same shape (n, 3).
+        If the two arrays do not have the same shape (n, 3).
 
     Examples
     --------

@@ -120,8 +120,8 @@ def level(
         Path,
         typer.Argument(
             metavar="results",
-            help="Results folder of register, whose record gives defaults of the options below; or the unloaded image "
-            "alone.",
+            help="Results folder of register, from whose record options that are not given are taken; or the unloaded "
+            "image alone.",
         ),
     ],
     model: Annotated[Path, typer.Argument(help="Folder of a model with one file per load, as in compare.")],

@@ -139,7 +139,7 @@ def demo(
         typer.Option(
             "--full",
             help="Full size (about an hour): all seven published material sets on a mesh of about 75,000 cells. The "
-            "set friedman reaches its time limit before the full load.",
+            "simulation with friedman ends at its time limit, before the full load.",
         ),
     ] = False,
     workers: Workers = None,

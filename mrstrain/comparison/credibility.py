@@ -174,7 +174,7 @@ def _solved(held: Holdings) -> str:
     loads = [(one.name, load, part) for one in held.models for load, part in (one.reached or {}).items()]
     if not loads:
         return ""
-    short = ", ".join(f"{model} {load} {part:.0%}" for model, load, part in loads if part < 1.0)
+    short = ", ".join(f"{model} {load} {100 * part:.0f} %" for model, load, part in loads if part < 1.0)
     reached = f"reached in part: {short}" if short else "all loads reached by all models"
     force = f"{100.0 * Tolerance().force:g} % of those on the plate and the fixed nodes"
     most = f"at most {force}, or ten times that if the iteration stagnates"

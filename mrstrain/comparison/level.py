@@ -146,7 +146,7 @@ def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int)
         if changed > _FEW:
             notes.append(
                 f"{load}: the displacement of the model was smoothed around nearly flat cells before the image was "
-                f"warped; it changed by over {_CHANGED_MM:g} mm in {changed:.0%} of the cells."
+                f"warped; it changed by over {_CHANGED_MM:g} mm in {100 * changed:.0f} % of the cells."
             )
         images[load] = synthetic_warp(subject.reference, body, field, Acquisition(seed)).image
     return images, notes

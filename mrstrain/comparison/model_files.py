@@ -153,7 +153,8 @@ def model_files(
             if load not in chosen:
                 notes.append(f"{name} has no result for {load}.")
             elif reached is not None and reached.get(load, 0.0) < 1.0:
-                notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}; this load is not compared.")
+                share = f"{100 * reached.get(load, 0.0):.0f} %"
+                notes.append(f"{name} reached only {share} of {load}; this load is not compared.")
             elif (end := early_end(chosen[load])) and end.certain and not usual.unfinished:
                 notes.append(
                     f"{name}: the run of {load} {end.reason}; this load is not compared. To compare it anyway, use "
@@ -167,7 +168,8 @@ def model_files(
                 if stable is not None and stable.get(load, 1.0) < 1.0:
                     notes.append(
                         f"{name}, {load}: a material is not stable (Drucker) at the strain reached, in up to "
-                        f"{1.0 - stable[load]:.1%} of a tissue. The model is compared, but do not trust its rank."
+                        f"{100 * (1.0 - stable[load]):.1f} % of a tissue. The model is compared, but do not trust its "
+                        "rank."
                     )
     files = {load: of for load, of in files.items() if of}
     if not files:

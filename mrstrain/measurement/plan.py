@@ -121,7 +121,7 @@ def _twin_check(
     maps = maps_of(again)
     folded = float(np.mean(maps.jacobian[tissue.inside] <= 0.0))
     if folded > _FOLDED:
-        return TwinCheck(None, f"Its registration folds in {folded:.1%} of the tissue, so it cannot be used.")
+        return TwinCheck(None, f"Its registration folds in {100 * folded:.1f} % of the tissue, so it cannot be used.")
     return TwinCheck(maps.max_shear)
 
 

@@ -51,7 +51,7 @@ class Converged:
         lines = ["Cell sizes, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
         for row in self.rows:
             values, of = ", ".join(f"{v:.4g}" for v in row.values), row.limit
-            tends = f"limit {of.limit:.4g} (order {of.order:.1f}), error of the finest mesh {of.error:+.1%}"
+            tends = f"limit {of.limit:.4g} (order {of.order:.1f}), error of the finest mesh {100 * of.error:+.1f} %"
             tends = (
                 tends if np.isfinite(of.limit) else "no limit, because the values do not approach one; use finer meshes"
             )
@@ -138,7 +138,7 @@ def converge(
 def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], float]:
     """Quantities compared between meshes, by load and name: plate displacement, and percentiles of the max. shear."""
     moved = {state.load.name: float(np.hypot(*state.plate_displacement_mm[:2])) for state in simulation.states}
-    return {(load, "plate displacement, mm"): travel for load, travel in moved.items()} | {
+    return {(load, "plate displacement, mm"): value for load, value in moved.items()} | {
         (row.load, f"{_SHEAR} of {region}, p{percent}"): value
         for row in simulation.regions
         if row.region == region

@@ -40,15 +40,15 @@ class Meshed:
             "Surface sets, faces: " + ", ".join(f"{name} {len(rows)}" for name, rows in self.mesh.facets.items()),
         ]
         lines += [
-            f"WARNING: the volume of {name} differs by {made / given - 1.0:+.1%} from the label map."
+            f"WARNING: the volume of {name} differs by {100 * (made / given - 1.0):+.1f} % from the label map."
             for name, made, given in q.volumes_ml
             if abs(made - given) > _CARE_VOLUME * given
         ]
         if q.least_angle_deg < _CARE_ANGLE_DEG:
             lines.append(f"WARNING: the smallest dihedral angle is {q.least_angle_deg:.1f} degrees.")
         lines += [
-            f"{share:.0%} of the cells of {name} extend through its whole thickness; give a shorter edge length there "
-            "(--finer)."
+            f"{100 * share:.0f} % of the cells of {name} extend through its whole thickness; give a shorter edge "
+            "length there (--finer)."
             for name, share in q.thin
         ]
         lines += [

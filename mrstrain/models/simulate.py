@@ -170,7 +170,7 @@ def material_sets(names: Sequence[str]) -> list[fe.MaterialSet]:
     """Material sets by published name or file; at least one is needed, each only once."""
     chosen = [fe.material_set(name) for name in names]
     if not chosen:
-        raise InputError("At least one material set (sets) is needed, such as trebbi.")
+        raise InputError("At least one material set is needed, such as trebbi.")
     if twice := clash(one.name for one in chosen):
         raise InputError(f"Two material sets are named {twice}; give each only once, or rename one.")
     return chosen

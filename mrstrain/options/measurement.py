@@ -201,8 +201,8 @@ class RegistrationOptions(EngineOptions):
     error_model: Annotated[Path | None, Cli(panel="Advanced")] = None
     """Error model written by `mrstrain accuracy`, instead of the built-in one."""
     twin: Flag = False
-    """Also register a synthetic warp (twin) of the unloaded image for each load, whose strain is known, to check the
-    error bars. Takes more than twice the time."""
+    """Check the error bars: for each load, also register a synthetic warp of the unloaded image (twin), whose strain is
+    known. Takes more than twice the time."""
     allow_unknown_parameters: Annotated[Flag, Cli(panel="Advanced")] = False
     """Accept elastix parameter names that mrstrain does not know."""
 
@@ -215,8 +215,8 @@ class Scans(Options):
     repeat: Path | None = None
     """Second unloaded image, which measures the noise floor."""
     landmarks: Path | None = None
-    """Point pairs that measure the registration error: CSV (x0,y0,z0,x1,y1,z1 in mm LPS). Only with one loaded
-    image."""
+    """Pairs of points, from which the registration error is computed: CSV (x0,y0,z0,x1,y1,z1 in mm LPS). Only with one
+    loaded image."""
     start: Annotated[Path | None, Cli(panel="Registration")] = None
     """Result of another registration program to start from and refine: a transform or displacement image. Only with one
     loaded image."""

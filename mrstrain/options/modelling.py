@@ -1,4 +1,4 @@
-"""Options of models: the synthetic heel, the mesh, the plate, the simulation, and the comparison with a measurement."""
+"""Options of models: the phantom heel, the mesh, the plate, the simulation, and the comparison with a measurement."""
 
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
@@ -103,7 +103,7 @@ class HeelShape(Options):
     size: Real = 1.0
     """Scale factor of all shapes; 1 is a calcaneus 67 mm long."""
     pad_mm: Annotated[Real, Cli("--pad")] = 18.0
-    """Thickness of the tissue below the calcaneus, with the skin, mm."""
+    """Thickness of the tissue below the calcaneus, including the skin, mm."""
     skin_mm: Annotated[Real, Cli("--skin")] = 2.0
     """Thickness of the skin, mm."""
     lobule_mm: Annotated[Real, Cli("--lobules")] = 6.0

@@ -20,8 +20,8 @@ class Uncertainty(Options):
     """Standard uncertainty of each input of the models; 0, the default, takes the input as exact."""
 
     mesh: NotNegative = 0.0
-    """Ratio of the edge lengths of a coarser mesh to those of the mesh, such as 1.4, to estimate the error of the
-    mesh; all variants are then solved on it."""
+    """Solve each model on a coarser mesh too, whose edges are longer by this factor, such as 1.4, to estimate the error
+    of the mesh. All variants are then solved on the coarser mesh."""
     force: NotNegative = 0.0
     """Relative standard uncertainty of the plate's forces."""
     force_n: NotNegative = 0.0

@@ -357,8 +357,8 @@ class _Look:
             there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
             if there < _THERE:
                 self.wrong.append(
-                    f"{self.study.path(self.study.mesh.labels)}: only {there:.0%} of the labelled tissue lies in the "
-                    "unloaded image. The label map to be meshed must be in the coordinates of the images."
+                    f"{self.study.path(self.study.mesh.labels)}: only {100 * there:.0f} % of the labelled tissue lies "
+                    "in the unloaded image. The label map to be meshed must be in the coordinates of the images."
                 )
         soft = [name for name in NAMES.values() if not is_bones_name(name)] if labels is None else self.soft(labels)
         for one in sets:

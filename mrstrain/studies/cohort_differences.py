@@ -31,8 +31,8 @@ def refuse_other_laws(studies: Sequence[Study]) -> None:
             first, other = seen.setdefault(one.name, (study.study.name, one))
             if not _same_laws(one, other):
                 raise InputError(
-                    f"The material set '{one.name}' differs between {study.study.name} and {first}. Rename one of the "
-                    "sets, or use the same file in both studies."
+                    f"The material set '{one.name}' differs between {study.study.name} and {first}. Rename one of "
+                    "them, or use the same file in both studies."
                 )
 
 

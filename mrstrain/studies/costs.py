@@ -59,7 +59,7 @@ _GIB = 1024.0**3
 
 
 def sizes_of(study: Study) -> tuple[float, float]:
-    """Number of voxels of the unloaded image, and approximate number of cells for the simulations (0 without sets).
+    """Number of voxels of the unloaded image, and approximate number of cells for the simulations (0 if there is none).
 
     If a file cannot be read, typical numbers are used; the stages that read the file report the error.
     """

@@ -69,7 +69,7 @@ def _converged(record: Mapping[str, Any], labels: str) -> str:
             larger = None not in (known, error) and abs(error) > abs(known or 0.0)
             largest[quantity] = error if error is None or larger else known
         sizes = ", ".join(f"{size:.2f}" for size in record["sizes_mm"])
-        errors = "; ".join(f"{f} {'no limit found' if e is None else f'{e:+.1%}'}" for f, e in largest.items())
+        errors = "; ".join(f"{f} {'no limit found' if e is None else f'{100 * e:+.1f} %'}" for f, e in largest.items())
         material = record["parameters"]["material"]
     except (LookupError, TypeError, ValueError, AttributeError):
         return ""

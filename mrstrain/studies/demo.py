@@ -69,7 +69,7 @@ def demo(
     out: The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second
         run in the same folder resumes.
     seed: Seed of the phantom.
-    full: All seven published material sets on about 75,000 tetrahedra; otherwise three sets on a coarser mesh.
+    full: All seven published material sets on about 75,000 tetrahedra; otherwise three on a coarser mesh.
     workers, progress, on_report: As in `mrstrain.run`.
     Returns the summary. It is complete unless a stage failed; a load that a model does not reach is not a failure.
     Raises OutputError if the folder contains another phantom, or other files that would be overwritten.

@@ -163,7 +163,7 @@ class Models(modelling.SimulationOptions):
     unfinished: Flag = False
     """Also compare results of FEBio and CalculiX whose run ended early."""
     drive: Flag = False
-    """Also simulate the sets with measured boundary conditions (`drive`)."""
+    """Also simulate the material sets with measured boundary conditions (`drive`)."""
     level: Flag = False
     """Also make the forward-model comparison of every simulated set (`level`)."""
     limit_s: Annotated[Positive | None, AfterValidator(_seconds)] = Field(

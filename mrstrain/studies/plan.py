@@ -272,7 +272,7 @@ def load_steps(study: Study) -> dict[str, LoadStep]:
         "Shear needs a normal force or plate displacement as well. Give normal_n (N) or normal_mm (mm) in these lines:"
         if lacking
         else "No load has a normal force or plate displacement, so nothing can be simulated. Give normal_n (N) or "
-        "normal_mm (mm) in at least one of these lines, or remove sets from [models] to measure only:"
+        "normal_mm (mm) in at least one of these lines, or remove `sets` from [models] to measure only:"
     )
     raise InputError("\n  ".join([told, *places]))
 

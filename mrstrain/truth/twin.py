@@ -61,7 +61,7 @@ def twin(
     told = " ".join(f"{subject_files.option(name)} {value}" for name, value in subject_files if value is not None)
     align = " --align none" if subject.bone is None else ""
     lines = (
-        f"Warped image: {target / _IMAGE}; it shows {made.shown:.0%} of the tissue. Truth: {target / _TRUTH}",
+        f"Warped image: {target / _IMAGE}; it shows {100 * made.shown:.0f} % of the tissue. Truth: {target / _TRUTH}",
         f"True {measured.strain_line}",
         f"To register it: mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}",
     )

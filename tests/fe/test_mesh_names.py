@@ -99,7 +99,7 @@ def test_the_summary_warns_of_volumes_and_angles(tmp_path: Path) -> None:
         return [line for line in Meshed(tmp_path, mesh, quality).summary() if line.startswith("WARNING")]
 
     assert told(9.7, 4.2) == [
-        "WARNING: the volume of fat differs by -3.0% from the label map.",
+        "WARNING: the volume of fat differs by -3.0 % from the label map.",
         "WARNING: the smallest dihedral angle is 4.2 degrees.",
     ]
     assert told(9.9, 12.0) == []

@@ -33,7 +33,7 @@ PRINTED = {
 
 
 def test_a_stiffness_in_another_unit_is_told() -> None:
-    """Ten times the range of the published sets, of the tissue or of what stands for it."""
+    """Ten times the range of the published material sets, of the tissue or of what stands for it."""
     fat, skin = Ogden.of(0.0105, 6.2), NeoHooke.of(0.1)
     usual = MaterialSet("mine", "", "", {"fat": fat, "skin": skin, "foam": NeoHooke.of(1e3)})
     assert usual.for_regions(["fat", "skin", "foam"])[1] == ()

@@ -106,9 +106,9 @@ def test_what_was_not_reached_comes_back_and_is_marked_everywhere(unreached: fe.
     moved = read.state("far & too much").plate_displacement_mm[0]
     assert f"far & too much {moved:.1f}" in unreached.headline
     assert unreached.headline == read.headline
-    assert unreached.headline.endswith(f" (ONLY {share:.0%} of the load)")
+    assert unreached.headline.endswith(f" (ONLY {100 * share:.0f} % of the load)")
     for words in (str(unreached), str(read)):
-        assert f"far & too much: ONLY {share:.0%} of the load was reached" in words
+        assert f"far & too much: ONLY {100 * share:.0f} % of the load was reached" in words
         assert "never was not tried" in words
     shown = unreached._repr_html_()
     assert "1 of 3 loads reached" in shown
@@ -242,3 +242,11 @@ def test_what_is_of_another_kind_is_refused_with_what_to_give(argument: int, giv
     arguments[argument] = given
     with pytest.raises(InputError, match=said):
         fe.simulate(*arguments)  # type: ignore[arg-type]
+
+
+def test_a_new_simulation_removes_the_figures_of_an_older_version_too(tmp_path: Path) -> None:
+    old, foreign = tmp_path / "force_travel.png", tmp_path / "notes.csv"
+    for path in (old, tmp_path / "force_displacement.csv", foreign):
+        path.touch()
+    fe.begin_simulation(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.csv", "simulation.json"]

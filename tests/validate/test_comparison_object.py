@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import validate
+from dvc.own_files import read_rows
 from dvc.report.page import shown
 from dvc.trust.error_model import ErrorTable
 from dvc.trust.verdict import Verdict
@@ -21,7 +22,7 @@ from tests.validate.test_comparison import case, cube, error_table, labels, max_
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
 from validate.ranking import rank_over_loads
 from validate.report import area_rows, load_sections, overview
-from validate.tables import read_curves
+from validate.tables import columns_of, read_curves, remove_earlier
 
 ROWS = ("areas", "overlaps", "agreements", "skin", "representations", "model_forms")
 GAMMAS = {"half": 0.2, "double": 0.8}
@@ -112,6 +113,41 @@ def test_a_folder_without_a_comparison_is_refused(folder: Path, tmp_path: Path) 
     (tmp_path / "curves.csv").write_text(re.sub(r"(\d)\.(\d)", r"\1..\2", whole))
     with pytest.raises(InputError, match=r"curves\.csv: the table of the comparison is damaged .* Compare again"):
         read_curves(tmp_path)
+
+
+def test_the_curves_of_a_figure_stand_beside_it(comparison: Comparison, folder: Path) -> None:
+    every = columns_of(comparison.curves)
+    for beside, of_figure in (("curves_by_load", {"tissue": ALL}), ("Load2/curves", {"load": "Load2"})):
+        assert (folder / f"{beside}.pdf").is_file()
+        (key, value), rows = *of_figure.items(), read_rows(folder / f"{beside}.csv")
+        shown = [number for number, at in enumerate(every[key]) if at == value]
+        assert [(row["load"], row["tissue"], row["field"]) for row in rows] == [
+            (every["load"][n], every["tissue"][n], every["field"][n]) for n in shown
+        ]
+        for name in ("max_shear", "volume_above_ml"):
+            found = [float(row[name]) for row in rows]
+            assert found == pytest.approx([every[name][n] for n in shown], rel=1e-5), beside
+
+
+def test_a_report_says_what_unnamed_tissue_is(comparison: Comparison) -> None:
+    mesh, said = cube(4), "unnamed: tissue of the mesh that has no name of the label map"
+    aside = replace(labels(), labels=np.where(labels().labels == 2, 0, labels().labels))
+    bare = replace(mesh, regions={"part": np.arange(len(mesh.cells))})
+    one = case("Load1", sheared(0.45), [result("half", bare, sheared(0.2))], error_table(0.0, 0.01))
+    (table, *_), (named, *_) = (load_sections(of, {"a": None, "b": None}, None)[0].tables for of in
+                                (compare_load(one, aside), comparison.loads[0]))  # fmt: skip
+    assert "unnamed" in [row[1] for row in table.rows]
+    assert said in table.note
+    assert said not in named.note
+
+
+def test_an_older_comparison_has_another_name_of_a_table(folder: Path, tmp_path: Path) -> None:
+    for path in folder.glob("*.*"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "skin_displacement.csv").rename(tmp_path / "travel.csv")
+    assert Comparison.read(tmp_path).skin == Comparison.read(folder).skin != ()
+    remove_earlier(tmp_path, [])
+    assert not (tmp_path / "travel.csv").exists()
 
 
 def test_a_notebook_shows_the_answer_the_areas_and_the_curves(comparison: Comparison) -> None:

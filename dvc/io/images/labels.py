@@ -175,8 +175,8 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     boxes = f"It spans {box_told(*own.bounds_mm())} mm; the image {box_told(*grid.bounds_mm())} mm (LPS)."
     if share < _NEEDED_OVERLAP:
         raise GeometryError(
-            f"{what}: only {share:.0%} of its volume is inside the image; at least {_NEEDED_OVERLAP:.0%} is "
-            f"needed. {boxes} It was drawn on another image, or its header is wrong."
+            f"{what}: only {100 * share:.0f} % of its volume is inside the image; at least "
+            f"{100 * _NEEDED_OVERLAP:.0f} % is needed. {boxes} It was drawn on another image, or its header is wrong."
         )
     mirrored = _mirrored_axes(own, grid)
     if mirrored:

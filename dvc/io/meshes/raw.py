@@ -31,7 +31,7 @@ Members = Iterable[int | range]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawMesh:
-    """Nodes, cells, sets and nodal fields in the file's own unit, frame and order."""
+    """Nodes, cells, sets of either and nodal fields in the file's own unit, frame and order."""
 
     path: Path
     points: Any  # (n, 3)
@@ -77,8 +77,8 @@ class NumberedMesh:
     ) -> RawMesh:  # fmt: skip
         """The mesh by indices, cells grouped by kind.
 
-        Elements and fields must not name what the file does not define. Sets may; where nothing was left out, each
-        number of theirs that stands for nothing is logged as a warning. A range stands for what there is of it.
+        Elements and fields must not name what the file does not define. A set may; where nothing was left out, each
+        number in it that stands for nothing is logged as a warning. A range stands for what there is of it.
         """
         if not self.nodes:
             raise ImageFileError(f"{self.path}: no mesh in this file (no nodes).")

@@ -57,7 +57,7 @@ class Preset:
     parameters: dict[str, tuple[str, ...]]
 
     def complete(self, *, seed: int, combine: str = "Compose") -> dict[str, tuple[str, ...]]:
-        """All parameters of a run: the preset's, those that mrstrain sets for every run, and the seed of elastix.
+        """All parameters of a run: the preset's, those that mrstrain fixes for every run, and the seed of elastix.
 
         An initial transform is combined with the one sought as `combine` says, "Compose" or "Add".
         """

@@ -65,7 +65,7 @@ def test_labels_are_those_at_the_place_where_a_deformation_leads() -> None:
     assert chance[0] > 0.99
     assert chance[4] == pytest.approx(0.69, abs=0.05)  # half a voxel inside, of a border that is off by 1 mm
     body[:] = True
-    with pytest.raises(RegistrationError, match="cover 75% of the body"):
+    with pytest.raises(RegistrationError, match="cover 75 % of the body"):
         _sampled(labels, shift, grid, Mask(grid, body))
 
 

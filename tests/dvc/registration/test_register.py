@@ -263,7 +263,7 @@ def test_row_8_identical_images_are_refused(tiny_pair):
 def test_a_bone_mask_that_leaves_no_soft_tissue_is_refused(of, tiny_pair):
     everything = np.ones(tiny_pair.reference.grid.shape, dtype=bool)
     inside = everything if of == "image" else tissue_mask(tiny_pair.reference).inside
-    with pytest.raises(InputError, match=r"covers 100% of the body"):
+    with pytest.raises(InputError, match=r"covers 100 % of the body"):
         register(tiny_pair.reference, tiny_pair.loaded, bone=Mask(tiny_pair.reference.grid, inside))
 
 

@@ -78,8 +78,8 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     assert float(right["dice_high"]) == 1.0
     assert float(right["dice_perfect"]) > 0.95
     assert float(places["half", "Load1", "0.3"]["dice_high"]) < 0.5
-    travel = {(r["model"], r["load"]): r for r in rows(study / "out" / "travel.csv")}
-    assert float(travel["right", "Load1"]["model_along_mm"]) >= 0.0
+    skin = {(r["model"], r["load"]): r for r in rows(study / "out" / "skin_displacement.csv")}
+    assert float(skin["right", "Load1"]["model_along_mm"]) >= 0.0
     for load, gamma in LOADS.items():
         names = {p.name for p in (study / "out" / load).iterdir()}
         assert names >= {
@@ -175,20 +175,20 @@ def test_loads_that_models_did_not_carry_or_whose_laws_are_unstable_are_told(stu
         outcome = {"Load1": load1, "Load2": {"reached": 1.0, "stable_share": 1.0}}
         (study / model / "simulation.json").write_text(json.dumps({"outcome": outcome, "parameters": {}}))
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
-    assert "half reached only 42% of Load1; this load is not compared." in done.comparison.notes
+    assert "half reached only 42 % of Load1; this load is not compared." in done.comparison.notes
     assert [a.model for a in done.comparison.ranking.areas] == ["right"]
     assert [sorted(one.fields.models) for one in done.comparison.loads] == [["right"], ["half", "right"]]
     (told,) = [note for note in done.comparison.notes if "not stable (Drucker)" in note]
     assert told.startswith("right, Load1:")
-    assert "10.0%" in told
+    assert "10.0 %" in told
 
 
 def test_a_load_is_looked_at_along_its_own_directions(study: Path) -> None:
     """Of a shear along y the plate across x moves 'along', that across y goes in."""
     own = {"Load2": ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))}
     compare(study / "measured", [study / "right"], **given(study), towards=own)
-    travel = {r["load"]: r for r in rows(study / "out" / "travel.csv")}
-    usual, aside = (float(travel[load]["model_along_mm"]) for load in LOADS)
+    skin = {r["load"]: r for r in rows(study / "out" / "skin_displacement.csv")}
+    usual, aside = (float(skin[load]["model_along_mm"]) for load in LOADS)
     assert usual > 0.5
     assert aside < 0.05
     told = json.loads((study / "out" / "comparison.json").read_text())["parameters"]
@@ -209,7 +209,7 @@ def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Pat
 
     u = sheared(0.4).displacement(mesh.points_mm)
     off = written("off", mesh.points_mm - [6.0, 0.0, 0.0], u)  # a third of it in the bone
-    with pytest.raises(GeometryError, match=r"only \d+% of the model lies in the labelled soft tissue"):
+    with pytest.raises(GeometryError, match=r"only \d+ % of the model lies in the labelled soft tissue"):
         compare(study / "measured", [off], **given(study))
     assert not (study / "out").exists()
     a_bit = written("a bit", mesh.points_mm - [2.0, 0.0, 0.0], u)
@@ -219,7 +219,7 @@ def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Pat
     for name, words in (
         ("a bit", "check its frame"),
         ("moving", "mm at the bone"),
-        ("swollen", "mean change of cell volume is 33%"),
+        ("swollen", "mean change of cell volume is 33 %"),
     ):
         assert any(name in note and words in note for note in done.comparison.notes), (name, done.comparison.notes)
 

@@ -118,7 +118,7 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     calculated = evidence["Calculation verification and UQ results"]
     assert calculated.startswith("Mesh convergence: not given (mrstrain converge)")
     assert MESH_DOUBT in calculated
-    assert "reached in part: luboz Load1 40%" in calculated
+    assert "reached in part: luboz Load1 40 %" in calculated
     assert (
         "Measurement uncertainty: in the intervals. Input uncertainty: not given. Error of the mesh: not given"
         in calculated
@@ -158,7 +158,7 @@ def test_input_uncertainty_that_is_in_the_intervals_is_told_with_the_models_that
 
 
 def test_mesh_convergence_takes_the_place_of_the_known_doubt(tmp_path: Path) -> None:
-    found = "Mesh convergence of trebbi, cells of 3.0, 2.0, 1.5 mm, largest error of the finest mesh: p50 -2.0%."
+    found = "Mesh convergence of trebbi, cells of 3.0, 2.0, 1.5 mm, largest error of the finest mesh: p50 -2.0 %."
     told = str(credibility_section(held({"t": simulation(tmp_path, "t")}, convergence=(found,))).tables)
     assert told.count(found[:-1]) == 1
     assert MESH_DOUBT not in told

@@ -219,7 +219,7 @@ def test_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:
     assert "Load1: the displacement was used as given;" in text
     for absent in ("elastix", "SimpleITK", "fTetWild", "Hu Y", "Trebbi", "draws", "Klein"):
         assert absent not in text, absent
-    # a set of one's own on a mesh made elsewhere: neither the published sets nor the mesher
+    # a set of one's own on a mesh made elsewhere: neither published material sets nor the mesher
     text = told({"Load1": measured(tmp_path, "a", "none")}, {"mine": simulated(tmp_path, "mine")}, error_known=False)
     assert "without rigid alignment" in text
     assert "Hu 2020" not in text

@@ -31,7 +31,7 @@ def pressed(along: float, across: float) -> Affine:
     return Affine(matrix, np.zeros(3))
 
 
-def test_travel_is_positive_towards_the_foot_and_volume_change_that_of_the_map() -> None:
+def test_displacement_of_the_skin_is_positive_towards_the_foot_and_volume_change_that_of_the_map() -> None:
     mesh = cube(6)
     model = result("model", mesh, pressed(0.05, -0.1))
     found = map_fields(mesh, labels(), ["bone"], pressed(0.1, 0.05), {"model": model.deformation})
@@ -159,7 +159,7 @@ def test_what_is_written_is_what_was_found(study: Path) -> None:
     moved = sheared(0.5).displacement(mesh.points_mm)
     meshio.write(study / "part" / "Load1.vtu", meshio.Mesh(mesh.points_mm, [("tetra", kept)], {"u": moved}))
     done = compare(study / "measured" / "Load1", [study / "half", study / "part"], on_image=True, **given(study))
-    assert any(note.startswith("Load1: part covers only 50% of the mesh") for note in done.comparison.notes)
+    assert any(note.startswith("Load1: part covers only 50 % of the mesh") for note in done.comparison.notes)
     assert not any("half covers" in note for note in done.comparison.notes)
     (one,) = done.comparison.loads
     written = rows(study / "out" / "curves.csv")

@@ -50,7 +50,7 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
     assert told["verdict"]["reasons"][0] == reason
     assert told["verdict_by_load"]["Load2"] == {"level": "distrust", "reasons": ["The map of Load2 folds."]}
     assert told["verdict_by_load"]["Load1"]["level"] == "trust"
-    for table in ("areas", "location", "agreement", "travel", "curves"):
+    for table in ("areas", "location", "agreement", "skin_displacement", "curves"):
         levels = {(r["load"], r["verdict"]) for r in rows(study / "out" / f"{table}.csv")}
         assert levels == {("Load1", "trust"), ("Load2", "distrust")} | (
             {("all loads", "distrust")} if table == "areas" else set()
@@ -111,7 +111,7 @@ def test_what_is_refused_leaves_an_earlier_comparison_whole(plain, study: Path) 
     for more, error, message in (
         ({"bones": ["calcaneus"]}, InputError, "no label 'calcaneus'"),
         ({"mesh": study / "nowhere.vtu"}, (InputError, ImageFileError), "nowhere.vtu"),
-        ({"mesh": aside}, GeometryError, "aside.vtu: only 50% of the model lies in the labelled soft tissue"),
+        ({"mesh": aside}, GeometryError, "aside.vtu: only 50 % of the model lies in the labelled soft tissue"),
         ({"mesh": far}, GeometryError, "far.vtu does not lie in the image"),
         ({}, ImageFileError, "displacement.nii.gz"),
     ):

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
+from dvc.own_files import read_rows
 from fe import LoadStep, Plate, Problem, paths_of, published_names, read_tet_mesh, write_tet_mesh
 from fe.figures import _along_plate
 from fe.result import patch_volumes, volume_percentiles
@@ -79,8 +80,17 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         assert [file["name"] for file in told["inputs"]["sets"]] == ["mine.toml"]
         assert "C3D10" in (folder / "Load3.inp").read_text()
         assert (folder / "slices.png").stat().st_size > 10_000
-        assert (folder / "force_travel.png").stat().st_size > 5_000
-        assert {path.name for path in folder.glob("*.pdf")} == {"slices.pdf", "force_travel.pdf"}
+        assert (folder / "force_displacement.png").stat().st_size > 5_000
+        assert {path.name for path in folder.glob("*.pdf")} == {"slices.pdf", "force_displacement.pdf"}
+        drawn, steps = (read_rows(folder / f"{of}.csv") for of in ("force_displacement", "curve"))
+        assert {row["load"] for row in drawn} == {"Load1", "Load2", "Load3"}
+        for axis in ("normal", "shear"):
+            for there, here in (
+                (f"{axis}_displacement_mm", f"travel_{axis}_mm"),
+                (f"{axis}_force_n", f"force_{axis}_n"),
+            ):
+                kept = [float(row[here]) for row in steps]
+                assert [float(row[there]) for row in drawn] == pytest.approx(kept, rel=1e-5, abs=1e-9)
         regions = np.genfromtxt(folder / "regions.csv", delimiter=",", names=True, dtype=None, encoding=None)
         assert len(regions) == 6
         assert (np.abs(regions["volume_change"]) < 0.02).all()
@@ -138,7 +148,7 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     done = CliRunner().invoke(app, ["simulate", str(mesh_file), "--set", "luboz", *loads, *PLATE, "--out", str(out)])
     said = " ".join(done.output.split())
     assert done.exit_code == 1, said
-    assert re.search(r"luboz, b: ONLY \d+% of the load was reached", said)
+    assert re.search(r"luboz, b: ONLY \d+ % of the load was reached", said)
     assert "luboz: c was not tried" in said
     assert re.search(r"b: no equilibrium was found beyond \d+ % of the load, .*\(lowest det F 0\.\d+\)", said)
     told = json.loads((out / "luboz" / "simulation.json").read_text())["outcome"]

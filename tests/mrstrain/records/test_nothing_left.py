@@ -89,7 +89,7 @@ REFUSED: dict[str, tuple[str, Give]] = {
         "rigid alignment on the bone failed",
         lambda out, files: mrstrain.register(LOAD0, [LOAD1], out=out, bone=bone(files), workers=1)),
     "register, the whole image as bone": (
-        "The bone mask covers 100% of the body, so there is no soft tissue",
+        "The bone mask covers 100 % of the body, so there is no soft tissue",
         lambda out, files: mrstrain.register(LOAD0, [LOAD1], out=out, bone=bone(files, whole=True), workers=1),
     ),
     "register, no such label": (

@@ -221,7 +221,7 @@ def test_a_label_map_to_mesh_that_lies_elsewhere_and_one_image_for_two_loads_are
     values[:4] = 2
     write_labels(study / "far.nii.gz", LabelMap(far, values, {1: "fat", 2: "bone"}))
     there = ("[mesh]", '[mesh]\nlabels = "far.nii.gz"\nnames = "tissues.csv"')
-    assert "only 0% of the labelled tissue lies in the unloaded image" in wrong(study, there)
+    assert "only 0 % of the labelled tissue lies in the unloaded image" in wrong(study, there)
     twice = ("[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\n[plate]')
     assert wrong(study, twice) == "Load2 is identical to the image of Load1 (all voxels are equal)."
     forceless = (twice[0], twice[1].replace("normal_n = 2.0\n", ""))

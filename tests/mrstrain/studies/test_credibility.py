@@ -133,11 +133,11 @@ def test_mesh_convergence_is_found_for_the_label_map_that_is_meshed_alone(study:
     converged(study.place / "converged", study.place / "tissues.nii.gz")
     (told,) = convergence_of(study)
     assert told == (
-        "Mesh convergence of trebbi, cells of 3.00, 2.00, 1.50 mm, largest error of the finest mesh: p50 of fat +5.0%; "
-        "plate no limit found."
+        "Mesh convergence of trebbi, cells of 3.00, 2.00, 1.50 mm, largest error of the finest mesh: p50 of fat +5.0 "
+        "%; plate no limit found."
     )
     page = page_of(study, ended(study, register_Load1=SOUND))
-    assert "p50 of fat +5.0%" in part(page, "Credibility (ASME")
+    assert "p50 of fat +5.0 %" in part(page, "Credibility (ASME")
 
 
 @pytest.mark.parametrize("changes", [{"rows": 3}, {"rows": [{}]}, {"inputs": None}, {"sizes_mm": ["x"]}])

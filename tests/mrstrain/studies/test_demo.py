@@ -109,9 +109,9 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     assert "Load4 0.022 (0.44)" in lines[1]
     assert lines[2:4] == ["All loads, area in mL: trebbi 2.5", "Best match over all loads (area metric): trebbi."]
     assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
-    outcomes["simulate erdemir"] = ended("simulate erdemir", "erdemir, Load1: ONLY 75% of the load", complete=False)
+    outcomes["simulate erdemir"] = ended("simulate erdemir", "erdemir, Load1: ONLY 75 % of the load", complete=False)
     lines = _summary(errors, StudyRun(study, outcomes))
-    assert lines[4] == "simulate erdemir: partial. erdemir, Load1: ONLY 75% of the load"
+    assert lines[4] == "simulate erdemir: partial. erdemir, Load1: ONLY 75 % of the load"
     assert lines[5].startswith("Report: ")
 
 

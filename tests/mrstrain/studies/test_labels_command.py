@@ -78,7 +78,7 @@ def test_what_the_command_writes_is_the_label_map(folder, tiny_pair):
         ("'{python}' -c 'import os; os.kill(os.getpid(), 9)' {image} {labels}", "signal 9 ended it, most often for"),
         ("'{python}' -c 'input()' {image} {labels}", "EOFError"),
         ("'{python}' copy.py empty.nii.gz {labels} {image}", "empty"),
-        ("'{python}' copy.py elsewhere.nii.gz {labels} {image}", "only 0% of its volume is inside the image"),
+        ("'{python}' copy.py elsewhere.nii.gz {labels} {image}", "only 0 % of its volume is inside the image"),
         ("'{python}' copy.py segment.py {labels} {image}", "_of_command.nii.gz"),
         ("segment {image}", "the command needs {labels} where it takes the label map"),
         ("segment '{image} {labels}", "No closing quotation"),

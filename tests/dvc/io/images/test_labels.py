@@ -300,7 +300,7 @@ class TestFitMask:
 
     def test_another_frame_is_refused_with_both_boxes(self) -> None:
         far = Grid(_GRID.shape, _GRID.spacing_mm, _GRID.origin_mm + 500.0, _TURN)
-        with pytest.raises(GeometryError, match="0% of its volume is inside the image") as caught:
+        with pytest.raises(GeometryError, match="0 % of its volume is inside the image") as caught:
             fit_mask(Mask(far, _ball(_GRID)), _GRID, "bone.nii")
         assert f"It spans {box_told(*far.bounds_mm())} mm; the image {box_told(*_GRID.bounds_mm())} mm" in str(
             caught.value
@@ -324,7 +324,7 @@ class TestFitMask:
         origin = _GRID.points_at(np.array([shift, 0.0, 0.0]))
         full = Mask(Grid(_GRID.shape, _GRID.spacing_mm, origin, _TURN), np.ones(_GRID.shape, dtype=bool))
         if refused:
-            with pytest.raises(GeometryError, match="45% of its volume"):
+            with pytest.raises(GeometryError, match="45 % of its volume"):
                 fit_mask(full, _GRID)
         else:
             assert fit_mask(full, _GRID).volume_mm3 == pytest.approx(full.volume_mm3 * 11 / 20)
@@ -366,7 +366,7 @@ def test_real_labels(real_data: Path) -> None:
     legs = read_labels(real_data / "leg-mr" / "labels.nii.gz")
     assert len(legs.names) == 14
     # the labels belong to another field of view than these images
-    with pytest.raises(GeometryError, match="0% of its volume"):
+    with pytest.raises(GeometryError, match="0 % of its volume"):
         fit_mask(legs, read_image(real_data / "leg-mr" / "fat.nii.gz").grid)
     lung = real_data / "lung-landmarks"
     mask = read_mask(lung / "3DCT_lung_baseline_mask.mha", read_image(lung / "3DCT_lung.mha").grid)
