@@ -15,7 +15,7 @@ _NO_MEMORY = (
 
 
 def is_lack_of_memory(failure: BaseException | None) -> bool:
-    """Whether an error, or the one that caused it, says that memory ran out.
+    """Whether an error, one that caused it, or one that it came up in the handling of, says that memory ran out.
 
     >>> is_lack_of_memory(ImportError("_core.so: failed to map segment from shared object"))
     True
@@ -23,7 +23,7 @@ def is_lack_of_memory(failure: BaseException | None) -> bool:
     while failure is not None:
         if isinstance(failure, MemoryError) or any(sign in str(failure) for sign in _NO_MEMORY):
             return True
-        failure = failure.__cause__
+        failure = failure.__cause__ or (None if failure.__suppress_context__ else failure.__context__)
     return False
 
 
