@@ -29,8 +29,8 @@ FIXED_WEIGHTS = "The regularisation weights of a repeat scan are fixed, so that 
 """In place of the table of weights, for a repeat scan."""
 _COMPONENTS = (
     "Root mean square over the voxels of the tissue: of u_x, u_y and u_z; of E_xx, E_yy and E_zz; of E_xy, E_xz and "
-    "E_yz. The values are the same in any coordinate system. The expanded uncertainty (k = 2) is twice as large. "
-    "components.csv has means and biases."
+    "E_yz, each minus its bias. The values are the same in any coordinate system. The expanded uncertainty (k = 2) is "
+    "twice as large. components.csv has means and biases."
 )
 _TWIN = (
     "The unloaded image was warped by the measured displacement, fresh noise was added, and the pair was registered "

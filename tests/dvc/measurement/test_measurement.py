@@ -136,6 +136,7 @@ def test_what_is_written_is_read_again(measured, written):
         measured.quality.as_dict(),
     )
     np.testing.assert_array_equal(again.sigma, measured.sigma)
+    np.testing.assert_array_equal(again.bias, measured.bias)
     for name in ("strain_bias", "normal_strain", "shear_strain", "displacement_mm"):
         np.testing.assert_array_equal(getattr(again.components, name), getattr(measured.components, name), err_msg=name)
     for one, other in zip(again.components.rows, measured.components.rows, strict=True):
@@ -354,7 +355,7 @@ def _without_verdict(path: Path) -> None:
     ("name", "harm"),
     [
         *((name, _cut) for name in (files.DISPLACEMENT, files.GREEN_LAGRANGE, files.MAX_SHEAR, files.VALID)),
-        *((name, _cut) for name in (files.QUALITY, files.SIGMA, files.ERROR_MODEL, files.SPLINE)),
+        *((name, _cut) for name in (files.QUALITY, files.SIGMA, files.BIAS, files.ERROR_MODEL, files.SPLINE)),
         *((name, Path.unlink) for name in (files.DISPLACEMENT, files.JACOBIAN, files.QUALITY, files.REGIONS)),
         *((name, Path.unlink) for name in (files.SIGMA, files.INTERVALS)),
         (files.QUALITY, _without_verdict),
