@@ -81,8 +81,8 @@ def uncertainty_of(
 
     The truth is drawn 200 times for all tissues at once: measured shear, less the bias of one of the study's
     registrations, drawn anew each time, less a Gaussian field of its standard deviation and of the table's correlation
-    length; not below zero. The interval of the draws is widened by a factor from motions left out (conformal
-    prediction), so that it holds in 95 % of cases like those of the study.
+    length; not below zero. The interval of the draws is widened by the factor by which 95 % of the statistics of
+    motions left out lay in theirs (97 % for the models that ship). No coverage is guaranteed for other motions.
     """
     bias, sigma = (np.full(grid.shape, np.nan, dtype=np.float32) for _ in range(2))
     measured = {name: inside & np.isfinite(max_shear) for name, inside in regions.items()}
