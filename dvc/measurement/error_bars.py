@@ -17,6 +17,7 @@ from dvc.registration.register import Registration
 from dvc.trust.components import ComponentUncertainty, components_of
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
 from dvc.trust.field_draws import FieldDraws, TrueField
+from dvc.trust.gaps import without_gaps
 from dvc.trust.twin_judgement import Judged, judged
 from dvc.trust.uncertainty import Interval, Uncertainty, uncertainty_of, widened
 
@@ -103,12 +104,14 @@ class ErrorBars:
         Raises
         ------
         InputError
-            Without error bars, or if the tissue is not in the measurement.
+            Without error bars, or if the tissue is not in the measurement or has no intervals.
         """
         sure = self._known("There is no interval")
         names = dict.fromkeys((*sure.regions, POOLED))
         if tissue.lower() not in {name.lower() for name in names}:
             raise InputError(f"Unknown tissue '{tissue}'; choose one of {', '.join(names)}.")
+        if any(np.isnan(i.low) for i in sure.intervals if i.region.lower() == tissue.lower()):
+            raise InputError(f"{tissue} has no interval. {self.explanation}")
         low, median, high = widened(np.asarray(values, dtype=np.float64)[:, None], sure.table.factor_of(tissue))
         return float(low[0]), float(median[0]), float(high[0])
 
@@ -164,6 +167,7 @@ def error_bars(
     wider = _wider(rows)
     sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
     sure = replace(sure, components=components_of(maps, regions, to_bone, table, wider))
+    sure, gaps = without_gaps(sure, chosen.preset, labels_from_image=subject.from_image is not None)
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
     own_errors = f"Errors were measured for {known}; other tissues use" if known else "All tissues use"
     voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
@@ -173,6 +177,7 @@ def error_bars(
         f"{chosen.source}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies to tissue "
         "that is strained and imaged like these phantoms."
     )
+    told = " ".join((told, *gaps))
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
 
 

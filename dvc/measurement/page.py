@@ -164,13 +164,16 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
     def told(strain: float) -> str:
         return f"{strain:z.3f}" if np.isfinite(strain) else shown(strain)
 
-    known = {(i.region, i.statistic): f" ({told(i.low)} to {told(i.high)})" for i in intervals}
+    ends = {(i.region, i.statistic): (i.low, i.high) for i in intervals}
+    known = {of: f" ({told(low)} to {told(high)})" for of, (low, high) in ends.items() if not np.isnan(low)}
     rows = tuple(
         (r.region, *(told(getattr(r, figure)) + known.get((r.region, figure), "") for figure in ("median", "p95")))
         for r in regions
         if r.quantity == "max_shear"
     )
     note = "In brackets: interval of 95 % coverage, from the error model." if known else ""
+    if len(known) < len(ends):
+        note = f"{note} No interval where its coverage is known to be too low (see the load).".strip()
     return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 
 
