@@ -175,7 +175,7 @@ def error_bars(
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
         f"{chosen.source}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies to tissue "
-        "that is strained and imaged like these phantoms."
+        "that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
     )
     told = " ".join((told, *gaps))
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
@@ -223,8 +223,10 @@ def _held(table: ErrorTable) -> str:
         return "The coverage of these intervals is not known: the error model rests on a single registration."
     factors = {f"{factor:.1f}" for factor in (table.widening_of or {"": table.factor}).values()}
     times = " to ".join(dict.fromkeys((min(factors, key=float), max(factors, key=float))))
-    where = "image pairs moved by finite-element solutions" if table.widening_of else "the parts of the study left out"
-    return f"Intervals are widened {times} times, so that they contain 95 % of the true values in {where}."
+    share, where = 95, "the parts of the study left out"
+    if table.widening_of:
+        share, where = 97, "image pairs moved by finite-element solutions"
+    return f"Intervals are widened {times} times, so that they contain {share} % of the true values in {where}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
