@@ -17,6 +17,7 @@ READ = sorted(
     page for page in DOCS.rglob("*.md") if not (LOOKED_UP | RECORDS) & set(page.relative_to(DOCS).parts)
 )  # fmt: skip
 ABOVE_THE_FOLD = 15  # lines
+NOTE_TO_SELF = re.compile(r"\b(TODO|FIXME|TBD|XXX)\b|\((and )?(add|insert|delete|reword)\b|to the glossary\)", re.I)
 PICTURE = re.compile(r"^!\[(.*)\]\((.*)\)$", re.MULTILINE)
 
 
@@ -63,3 +64,10 @@ def test_files_shown_on_a_page_can_be_read_and_lines_are_wrapped_alike(page: Pat
         assert {"toml": tomllib.loads, "json": json.loads}[language](block), block
     links = re.compile(r"\]\([^)]*\)")  # a long address cannot be wrapped
     assert not [line for line in prose(text) if len(links.sub("]()", line)) > 120]
+
+
+def test_no_page_keeps_a_note_of_its_writer() -> None:
+    assert NOTE_TO_SELF.search("a truth (and add 'drawn truth: a sample' to the glossary)")
+    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md"), *(ROOT / "benchmarks").rglob("*.md")]
+    notes = [(page.name, found[0]) for page in pages for found in NOTE_TO_SELF.finditer(page.read_text())]
+    assert not notes, notes

@@ -1,7 +1,7 @@
 """The error bars of one load in its results folder: their writer and reader."""
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,6 +14,7 @@ from dvc.io.images.labels import read_labels
 from dvc.io.images.write import write_image, write_labels
 from dvc.io.result_folder import (
     AGAIN,
+    BIAS,
     COMPONENTS,
     ERROR_MODEL,
     INTERVALS,
@@ -48,6 +49,8 @@ def write_uncertainty(folder: Path, grid: Grid, sure: Uncertainty, model: ErrorM
     if model is not None:
         model.write(folder / ERROR_MODEL)
     write_image(folder / SIGMA, Image(grid, sure.sigma))
+    if sure.bias is not None:
+        write_image(folder / BIAS, Image(grid, sure.bias))
     _write_rows(folder / INTERVALS, Interval, sure.intervals, verdict)
     if sure.to_bone_mm is not None and sure.regions:
         numbers = np.zeros(grid.shape, dtype=np.int64)
@@ -67,14 +70,16 @@ def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel]
     if not (folder / ERROR_MODEL).is_file():
         return None
     model, sigma = read_error_model(folder / ERROR_MODEL), read_scalar(folder / SIGMA, grid)
+    bias = read_scalar(folder / BIAS, grid).values if (folder / BIAS).is_file() else None  # not in former versions
     intervals = _read_rows(folder / INTERVALS, Interval, 2)
-    sure = Uncertainty(sigma.values, intervals, model.tables[0])
+    sure = Uncertainty(sigma.values, intervals, model.tables[0], bias=bias)
     if model.tables[0].has_components or (folder / SOFT_TISSUES).is_file():  # not in folders of former versions
         tissues = read_labels(there(folder / SOFT_TISSUES), there(folder / SOFT_TISSUES.replace(".nii.gz", ".csv")))
         same_grid(folder / SOFT_TISSUES, tissues.grid, grid)
         regions = {name: tissues.labels == number for number, name in tissues.names.items()}
         to_bone = read_scalar(folder / TO_BONE, grid).values
-        sure = Uncertainty(sure.sigma, intervals, sure.table, regions, to_bone, _read_components(folder, grid, model))
+        parts = _read_components(folder, grid, model)
+        sure = replace(sure, regions=regions, to_bone_mm=to_bone, components=parts)
     return sure, model
 
 

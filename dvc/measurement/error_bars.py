@@ -1,7 +1,7 @@
 """The error bars of a registered load: its preset's error model applied to its strain map."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
@@ -14,11 +14,12 @@ from dvc.images.depth import to_surface_mm
 from dvc.images.image import Grid, Mask
 from dvc.measurement.subject import Subject, is_bones_name
 from dvc.registration.register import Registration
-from dvc.trust.components import components_of
+from dvc.trust.components import ComponentUncertainty, components_of
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
-from dvc.trust.field_draws import FieldDraws
+from dvc.trust.field_draws import FieldDraws, TrueField
+from dvc.trust.gaps import without_gaps
 from dvc.trust.twin_judgement import Judged, judged
-from dvc.trust.uncertainty import Uncertainty, uncertainty_of
+from dvc.trust.uncertainty import Interval, Uncertainty, uncertainty_of, widened
 
 _MOSTLY = 0.5
 
@@ -32,6 +33,26 @@ class ErrorBars:
     model: ErrorModel | None = None  # with the one table that was used
     twin: tuple[Judged, ...] = ()  # how the shear came back from the pair's twin, by tissue
     of_twin: str = ""  # what that did to the error bars
+
+    @property
+    def sigma(self) -> Float32Array | None:
+        """See `Uncertainty`; None without error bars."""
+        return None if self.uncertainty is None else self.uncertainty.sigma
+
+    @property
+    def bias(self) -> Float32Array | None:
+        """See `Uncertainty`; None without error bars, and in results of older versions."""
+        return None if self.uncertainty is None else self.uncertainty.bias
+
+    @property
+    def intervals(self) -> tuple[Interval, ...]:
+        """See `Uncertainty`; empty without error bars."""
+        return () if self.uncertainty is None else self.uncertainty.intervals
+
+    @property
+    def components(self) -> ComponentUncertainty | None:
+        """See `Uncertainty`; None without error bars for components."""
+        return None if self.uncertainty is None else self.uncertainty.components
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
@@ -49,16 +70,55 @@ class ErrorBars:
         twin = tuple(Judged(**row) for row in told.get("twin", ()))
         return cls(uncertainty, str(told.get("source", told.get("reason", ""))), model, twin, told.get("of_twin", ""))
 
-    def draws(self, maps: StrainMaps, seed: int) -> FieldDraws:
-        """Draws of the true fields of a measurement; InputError where its errors are not known."""
-        sure = self.uncertainty
-        if sure is None:
-            raise InputError(f"True fields cannot be drawn, because there are no error bars. {self.explanation}")
+    def draws(self, maps: StrainMaps, count: int, seed: int) -> Iterator[TrueField]:
+        """Draw true fields of a measurement, one after the other; InputError where its errors are not known."""
+        if count < 1:
+            raise InputError(f"The number of draws must be 1 or more; got {count}.")
+        sure = self._known("True fields cannot be drawn")
         if sure.to_bone_mm is None:
             raise InputError(
                 "True fields cannot be drawn from results of an older version. Register these images again."
             )
-        return FieldDraws(maps, sure.regions, sure.to_bone_mm, sure.table, seed=seed, wider=_wider(self.twin))
+        draws = FieldDraws(maps, sure.regions, sure.to_bone_mm, sure.table, seed=seed, wider=_wider(self.twin))
+        return (draws.drawn() for _ in range(count))
+
+    def interval_of(self, values: Sequence[float], tissue: str) -> tuple[float, float, float]:
+        """95 % interval of a statistic of the maximum shear strain in one tissue, from its values in true fields drawn.
+
+        The 2.5th and 97.5th percentile, moved away from the median by the factor of the tissue, as those of
+        `Uncertainty.intervals`. The factor was found for percentiles and volumes above a strain; for components of the
+        strain and for the displacement none is known.
+
+        Parameters
+        ----------
+        values : sequence of float
+            The statistic in each of the fields of `Measurement.draws`; 100 or more for steady ends.
+        tissue : str
+            Whose voxels it was computed from; "soft tissue" for several tissues together.
+
+        Returns
+        -------
+        low, median, high : float
+            No end is below zero, as no percentile or volume is.
+
+        Raises
+        ------
+        InputError
+            Without error bars, or if the tissue is not in the measurement or has no intervals.
+        """
+        sure = self._known("There is no interval")
+        names = dict.fromkeys((*sure.regions, POOLED))
+        if tissue.lower() not in {name.lower() for name in names}:
+            raise InputError(f"Unknown tissue '{tissue}'; choose one of {', '.join(names)}.")
+        if any(np.isnan(i.low) for i in sure.intervals if i.region.lower() == tissue.lower()):
+            raise InputError(f"{tissue} has no interval. {self.explanation}")
+        low, median, high = widened(np.asarray(values, dtype=np.float64)[:, None], sure.table.factor_of(tissue))
+        return float(low[0]), float(median[0]), float(high[0])
+
+    def _known(self, lacking: str) -> Uncertainty:
+        if self.uncertainty is None:
+            raise InputError(f"{lacking}, because there are no error bars. {self.explanation}")
+        return self.uncertainty
 
     @property
     def summary(self) -> list[str]:
@@ -107,6 +167,7 @@ def error_bars(
     wider = _wider(rows)
     sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
     sure = replace(sure, components=components_of(maps, regions, to_bone, table, wider))
+    sure, gaps = without_gaps(sure, chosen.preset, labels_from_image=subject.from_image is not None)
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
     own_errors = f"Errors were measured for {known}; other tissues use" if known else "All tissues use"
     voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
@@ -114,8 +175,9 @@ def error_bars(
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
         f"{chosen.source}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies to tissue "
-        "that is strained and imaged like these phantoms."
+        "that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
     )
+    told = " ".join((told, *gaps))
     return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
 
 
@@ -161,8 +223,10 @@ def _held(table: ErrorTable) -> str:
         return "The coverage of these intervals is not known: the error model rests on a single registration."
     factors = {f"{factor:.1f}" for factor in (table.widening_of or {"": table.factor}).values()}
     times = " to ".join(dict.fromkeys((min(factors, key=float), max(factors, key=float))))
-    where = "image pairs moved by finite-element solutions" if table.widening_of else "the parts of the study left out"
-    return f"Intervals are widened {times} times, so that they contain 95 % of the true values in {where}."
+    share, where = 95, "the parts of the study left out"
+    if table.widening_of:
+        share, where = 97, "image pairs moved by finite-element solutions"
+    return f"Intervals are widened {times} times, so that they contain {share} % of the true values in {where}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:

@@ -59,7 +59,7 @@ class Measurement:
     regions : tuple of RegionRow
         Statistics of maximum shear strain, det F and displacement by region.
     error_bars : ErrorBars
-        Standard deviation and intervals of the maximum shear strain, or why there are none.
+        Bias, standard deviation and intervals of the maximum shear strain, or why there are none.
     image : Image or None
         Image below the maps in figures: the unloaded image, or the registered one if read from a folder.
     source : Source or None
@@ -187,22 +187,25 @@ class Measurement:
 
     @property
     def sigma(self) -> Float32Array | None:
-        """Standard deviation of the maximum shear strain (ni, nj, nk); None without error bars."""
-        known = self.error_bars.uncertainty
-        return None if known is None else known.sigma
+        """Standard uncertainty of max_shear - bias (ni, nj, nk), not of max_shear; None without error bars."""
+        return self.error_bars.sigma
+
+    @property
+    def bias(self) -> Float32Array | None:
+        """Expected error of max_shear (ni, nj, nk); None without error bars, or if an older version wrote them."""
+        return self.error_bars.bias
 
     @property
     def intervals(self) -> tuple[Interval, ...]:
         """95 % intervals of percentiles and volumes above a strain, by tissue; empty without error bars."""
-        known = self.error_bars.uncertainty
-        return () if known is None else known.intervals
+        return self.error_bars.intervals
 
     def draws(self, count: int, *, seed: int = 1) -> Iterator[TrueField]:
         """Draw true fields that agree with what was measured and with its errors, about 1 s each at 128^3 voxels.
 
-        The spread of a figure over the draws shows its uncertainty. Errors are alike in neighbouring voxels, partly the
-        same in a whole tissue, and in each draw those of one registration of the accuracy study. Draws are not widened
-        as `intervals` are.
+        Errors are alike in neighbouring voxels, partly the same in a whole tissue, and in each draw those of one
+        registration of the accuracy study. Draws are not widened as `intervals` are: for a statistic of the maximum
+        shear strain in a tissue, `ErrorBars.interval_of` makes of them an interval that is.
 
         Parameters
         ----------
@@ -221,16 +224,12 @@ class Measurement:
         InputError
             Without error bars, or if the error model has no components.
         """
-        if count < 1:
-            raise InputError(f"The number of draws must be 1 or more; got {count}.")
-        draws = self.error_bars.draws(self.maps, seed)
-        return (draws.drawn() for _ in range(count))
+        return self.error_bars.draws(self.maps, count, seed)
 
     @property
     def components(self) -> ComponentUncertainty | None:
         """Standard uncertainty of the components of strain and displacement; None without error bars for them."""
-        known = self.error_bars.uncertainty
-        return None if known is None else known.components
+        return self.error_bars.components
 
     @property
     def bone_motion(self) -> RigidMotion:

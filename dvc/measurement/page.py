@@ -30,8 +30,8 @@ FIXED_WEIGHTS = "The regularisation weights of a repeat scan are fixed, so that 
 """In place of the table of weights, for a repeat scan."""
 _COMPONENTS = (
     "Root mean square over the voxels of the tissue: of u_x, u_y and u_z; of E_xx, E_yy and E_zz; of E_xy, E_xz and "
-    "E_yz. The values are the same in any coordinate system. The expanded uncertainty (k = 2) is twice as large. "
-    "components.csv has means and biases."
+    "E_yz, each minus its bias. The values are the same in any coordinate system. The expanded uncertainty (k = 2) is "
+    "twice as large. components.csv has means and biases."
 )
 _TWIN = (
     "The unloaded image was warped by the measured displacement, fresh noise was added, and the pair was registered "
@@ -158,7 +158,7 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
 
 def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
     """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known."""
-    known = {(i.region, i.statistic): (i.low, i.high) for i in intervals}
+    known = {(i.region, i.statistic): (i.low, i.high) for i in intervals if not np.isnan(i.low)}
 
     def cells(r: RegionRow) -> tuple[Cell, ...]:
         median, high = (known.get((r.region, figure)) for figure in ("median", "p95"))
@@ -166,6 +166,8 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
 
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     note = "In brackets: interval of 95 % coverage, from the error model." if known else ""
+    if len(known) < len(intervals):
+        note = f"{note} No interval where its coverage is known to be too low (see the load).".strip()
     return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 
 

@@ -107,7 +107,8 @@ def image_slices(
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> Figure:
     """Standard uncertainty of the maximum shear strain in colour over the unloaded image, from the error model.
 
-    Grey: bone, or no result.
+    It is the standard deviation of the error about its bias (bias_max_shear.nii.gz): with the expanded uncertainty U,
+    the true value is expected within measured - bias ± U. Grey: bone, or no result.
     """
     return coloured(view, reference, sigma, Scale.of("sigma", sigma, largest)).finished()
 

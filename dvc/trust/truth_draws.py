@@ -85,7 +85,7 @@ class TruthDraws:
 
         About the tissue's mean m: m + (x - m) (1 - 2 s^2 / v)^(1/2), with v the variance of x and s^2 the mean square
         of the noise's deviation, which is in x once as measured and once as drawn; uniform where noise could have made
-        all of the spread.
+        all of the spread. Too narrow where the strain varies as in the study, whose bias takes the noise out already.
         """
         narrow = np.empty(len(truth))
         for here in self._tissues.values():

@@ -39,7 +39,7 @@ class Uncertainty:
     Attributes
     ----------
     sigma : (ni, nj, nk)
-        Standard deviation of the maximum shear strain about its bias; NaN where not known.
+        Standard deviation of the error of the maximum shear strain about its bias; NaN where not known.
     intervals : tuple of Interval
         Of the statistics of each tissue.
     table : ErrorTable
@@ -50,6 +50,9 @@ class Uncertainty:
         Distance to bone; None where not known, as in results of older versions.
     components : ComponentUncertainty or None
         Of the components of strain and displacement; None where the table has none.
+    bias : (ni, nj, nk) or None
+        Expected error of the maximum shear strain: the true value is about measured - bias, with the deviation sigma.
+        None in results of older versions.
     """
 
     sigma: Float32Array
@@ -58,6 +61,7 @@ class Uncertainty:
     regions: Mapping[str, BoolArray] = field(default_factory=dict)
     to_bone_mm: Float32Array | None = None
     components: ComponentUncertainty | None = None
+    bias: Float32Array | None = None
 
 
 def uncertainty_of(
@@ -77,26 +81,27 @@ def uncertainty_of(
 
     The truth is drawn 200 times for all tissues at once: measured shear, less the bias of one of the study's
     registrations, drawn anew each time, less a Gaussian field of its standard deviation and of the table's correlation
-    length; not below zero. The interval of the draws is widened by a factor from motions left out (conformal
-    prediction), so that it holds in 95 % of cases like those of the study.
+    length; not below zero. The interval of the draws is widened by the factor by which 95 % of the statistics of
+    motions left out lay in theirs (97 % for the models that ship). No coverage is guaranteed for other motions.
     """
-    sigma = np.full(grid.shape, np.nan, dtype=np.float32)
+    bias, sigma = (np.full(grid.shape, np.nan, dtype=np.float32) for _ in range(2))
     measured = {name: inside & np.isfinite(max_shear) for name, inside in regions.items()}
     measured = {name: where for name, where in measured.items() if where.any()}
     if not measured:
-        return Uncertainty(sigma, (), table, regions, to_bone_mm)
+        return Uncertainty(sigma, (), table, regions, to_bone_mm, bias=bias)
     volumes = [np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0 for where in measured.values()]
     drawn = _statistics_drawn(max_shear, grid.spacing_mm, measured, volumes, to_bone_mm, table, seed)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS)]
     intervals = []
     for (name, where), volume, statistics in zip(measured.items(), volumes, drawn, strict=True):
         shear, factor = max_shear[where].astype(np.float64), wider.get(name, 1.0)
-        sigma[where] = factor * table.expected(name, shear, to_bone_mm[where])[1]
+        bias[where], deviation = table.expected(name, shear, to_bone_mm[where])
+        sigma[where] = factor * deviation
         low, middle, high = widened(statistics, factor * table.factor_of(name))
         high[3:] = np.minimum(high[3:], volume)
         each = zip(names, statistics_of(shear, volume), middle, low, high, strict=True)
         intervals += [Interval(name, statistic, *map(float, numbers)) for statistic, *numbers in each]
-    return Uncertainty(sigma, tuple(intervals), table, regions, to_bone_mm)
+    return Uncertainty(sigma, tuple(intervals), table, regions, to_bone_mm, bias=bias)
 
 
 def _statistics_drawn(

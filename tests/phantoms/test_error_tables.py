@@ -11,6 +11,7 @@ import pytest
 from dvc import Grid, LabelMap
 from dvc.errors import InputError
 from dvc.trust.error_model import POOLED
+from dvc.trust.uncertainty import uncertainty_of
 from phantoms import (
     TISSUES,
     AccuracyCase,
@@ -258,6 +259,20 @@ def test_coverage_of_a_given_error_model() -> None:
     assert alike.voxels_within == pytest.approx(0.95, abs=0.02)
     (noisier,) = (r for r in coverage_rows([samples(new, sd=0.06, count=20_000)], model) if r.tissue == "fat")
     assert noisier.voxels_within < 0.6
+
+
+def test_a_voxels_expanded_uncertainty_covers_the_truth_about_the_value_less_its_bias() -> None:
+    """A strain measured .04 too small, in a run that the error model has not seen: not about the measured value."""
+    seen = [samples(replace(CASE, seed=s), bias=-0.04, sd=0.02, count=20_000) for s in (1, 2, 3)]
+    new = samples(replace(CASE, seed=4), bias=-0.04, sd=0.02, count=20_000)
+    (table,) = fit_error_model(seen, "", "").tables
+    line = (len(new.shear), 1, 1)
+    measured, true, to_bone = (of.reshape(line) for of in (new.shear, new.true_shear, new.to_bone_mm))
+    grid, fat = Grid(line, COARSE, (0.0, 0.0, 0.0)), np.ones(line, dtype=bool)
+    found = uncertainty_of(measured, grid, {"fat": fat}, to_bone, table)
+    assert found.bias is not None
+    assert np.mean(np.abs(measured - found.bias - true) < 1.96 * found.sigma) == pytest.approx(0.95, abs=0.02)
+    assert np.mean(np.abs(measured - true) < 1.96 * found.sigma) < 0.7
 
 
 def test_samples_survive_their_file_and_a_damaged_one_is_made_anew(tmp_path: Path) -> None:

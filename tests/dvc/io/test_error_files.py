@@ -74,6 +74,7 @@ def test_a_folder_of_a_former_version_is_read_without_components(tmp_path: Path)
     short = {POOLED: ROWS[:2]}
     written(tmp_path, replace(SURE, table=replace(TABLE, whole=short, runs=(short,)), regions={}, to_bone_mm=None))
     assert not (tmp_path / files.SOFT_TISSUES).exists()
+    assert not (tmp_path / files.BIAS).exists()
     sure, _ = read_uncertainty(tmp_path, GRID)
-    assert (sure.components, sure.to_bone_mm, sure.regions) == (None, None, {})
+    assert (sure.bias, sure.components, sure.to_bone_mm, sure.regions) == (None, None, None, {})
     assert sure.intervals == SURE.intervals

@@ -1,16 +1,21 @@
-"""The distance to bone that an error model asks for: computed where it is used, and exact there."""
+"""The distance to bone that an error model asks for, exact where it is used; and intervals from drawn fields."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from dvc.errors import InputError
 from dvc.images.depth import to_surface_mm
 from dvc.images.image import Grid, Image, Mask
 from dvc.measurement import error_bars
 from dvc.measurement.subject import Subject
 from dvc.trust.error_model import POOLED
+from dvc.trust.uncertainty import uncertainty_of
+from tests.dvc.trust.test_field_draws import FAR, GRID as FIELD, HALF, ROWS, TABLE, maps
 
 GRID = Grid((40, 36, 30), (0.8, 0.8, 1.6), (0.0, 0.0, 0.0))
 
@@ -43,3 +48,30 @@ def test_tissue_without_labels_has_the_name_that_its_intervals_have(with_bone):
     bone = Mask(GRID, np.arange(GRID.shape[0])[:, None, None] < 5 * body) if with_bone else None
     regions = Subject(Image(GRID, body.astype(np.float32)), bone).regions(Mask(GRID, body))
     assert regions.names == {1: POOLED} | ({2: "bone"} if with_bone else {})
+
+
+def test_an_interval_from_drawn_fields_is_as_wide_as_that_of_the_table():
+    """The median of a tissue errs as a whole: its draws are widened by the factor of the tissue, as its interval is."""
+    runs = tuple({POOLED: rows, "fat": rows} for rows in (ROWS + off for off in np.linspace(0.0, 0.04, 5)))
+    table = replace(TABLE, runs=runs, widening=1.5, widening_of={"fat": 3.0})
+    sure = uncertainty_of(maps().max_shear, FIELD, {"fat": HALF}, FAR, table)
+    bars = error_bars.ErrorBars(sure, "made up")
+    medians = [float(np.median(field.max_shear[HALF])) for field in bars.draws(maps(), 200, 1)]
+    low, median, high = bars.interval_of(medians, "Fat")
+    given = sure.intervals[0]
+    np.testing.assert_allclose([low, median, high], [given.low, given.estimate, given.high], atol=0.15 * (high - low))
+    as_drawn = np.subtract(*np.percentile(medians, [97.5, 2.5]))
+    assert high - low == pytest.approx(3.0 * as_drawn)
+    assert np.subtract(*bars.interval_of(medians, POOLED)[::-2]) == pytest.approx(1.5 * as_drawn)
+    with pytest.raises(InputError, match="Unknown tissue 'skin'; choose one of fat, soft tissue"):
+        bars.interval_of(medians, "skin")
+    with pytest.raises(InputError, match="because there are no error bars"):
+        error_bars.NO_ERROR_BARS.interval_of(medians, "fat")
+
+
+def test_the_fraction_is_told_for_which_the_factor_was_found():
+    """95 % where parts of the study itself were left out, 97 % for the models that ship; neither is a guarantee."""
+    own = replace(TABLE, widening=2.0)
+    assert "2.0 times, so that they contain 95 % of the true values in the parts" in error_bars._held(own)
+    shipped = error_bars._held(replace(own, widening_of={"fat": 3.0, "skin": 4.0}))
+    assert "3.0 to 4.0 times, so that they contain 97 % of the true values in image pairs" in shipped

@@ -189,6 +189,7 @@ def test_sigma_lies_where_the_shear_is_known_and_nowhere_else() -> None:
     found = uncertainty_of(shear, GRID, {"fat": fat}, np.full(GRID.shape, 9.0, dtype=np.float32), TABLE)
     np.testing.assert_array_equal(np.isfinite(found.sigma), fat & np.isfinite(shear))
     assert np.nanmax(np.abs(found.sigma - 0.01)) < 1e-6
+    np.testing.assert_array_equal(np.isfinite(found.bias), fat & np.isfinite(shear))
 
 
 def test_intervals_are_widened_from_their_middle_and_stay_possible() -> None:

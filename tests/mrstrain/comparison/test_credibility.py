@@ -15,7 +15,7 @@ import pytest
 from dvc import Verdict
 from dvc.report.page import Section, Table
 from fe import material_set
-from mrstrain.comparison.credibility import CODE, MESH_DOUBT, Holdings, credibility_section
+from mrstrain.comparison.credibility import CODE, COMPARATOR, MESH_DOUBT, Holdings, credibility_section
 from mrstrain.comparison.model_facts import ModelFacts, facts_of, used_for_calibration
 from mrstrain.measurement.acquisition import NOT_GIVEN
 from mrstrain.models.fit import fit
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[3]
 CATEGORIES = (
     "Code verification results", "Model calibration evidence", "Bench test validation results",
     "In vivo validation results", "Population-based validation results", "Emergent model behavior",
-    "Model plausibility", "Calculation verification and UQ results",
+    "Model plausibility", "Calculation verification and UQ results using simulations of the context of use",
 )  # fmt: skip
 FACTORS = (
     "Software quality assurance", "Numerical code verification", "Discretization error", "Numerical solver error",
@@ -115,14 +115,14 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     vivo = evidence["In vivo validation results"]
     assert vivo.startswith("Verdicts on the measurement: Load1 Trust. Best match over all loads (area metric): trebbi.")
     assert "its interval of 95 % coverage: trebbi 1.00 (0.50 to 1.50), luboz 1.00 (0.50 to 1.50), ansys" in vivo
-    calculated = evidence["Calculation verification and UQ results"]
-    assert calculated.startswith("Mesh convergence: not given (mrstrain converge)")
-    assert MESH_DOUBT in calculated
-    assert "reached in part: luboz Load1 40 %" in calculated
+    assert COMPARATOR in vivo
+    assert "Mesh convergence: not given (mrstrain converge)" in vivo
+    assert MESH_DOUBT in vivo
+    assert "reached in part: luboz Load1 40 %" in vivo
     assert (
-        "Measurement uncertainty: in the intervals. Input uncertainty: not given. Error of the mesh: not given"
-        in calculated
+        "Measurement uncertainty: in the intervals. Input uncertainty: not given. Error of the mesh: not given" in vivo
     )
+    assert evidence[CATEGORIES[7]].startswith(NOT_GIVEN)  # what is compared is no context of use
     for name in ("Bench test validation results", "Emergent model behavior"):
         assert evidence[name] == NOT_GIVEN
     assert rows(section, "Applicability") == {
@@ -150,11 +150,8 @@ def test_input_uncertainty_that_is_in_the_intervals_is_told_with_the_models_that
     folders = {name: simulation(tmp_path, name) for name in ("trebbi", "luboz")}
     one = comparison("trebbi", "luboz", inputs={"trebbi": (0.01, 0.02), "luboz": (np.nan, 0.01)})
     told = rows(credibility_section(held(folders, comparison=one)), "Evidence by category")
-    (calculated,) = told["8. Calculation verification and UQ results"]
-    assert (
-        "Input uncertainty: in the intervals of trebbi, luboz. Error of the mesh: in the intervals of trebbi"
-        in calculated
-    )
+    (vivo,) = told["4. In vivo validation results"]
+    assert "Input uncertainty: in the intervals of trebbi, luboz. Error of the mesh: in the intervals of trebbi" in vivo
 
 
 def test_mesh_convergence_takes_the_place_of_the_known_doubt(tmp_path: Path) -> None:
@@ -221,7 +218,7 @@ def test_figures_of_the_code_are_those_of_the_manual() -> None:
     lines = (ROOT / "README.md").read_text().splitlines()
     plain = next(line for line in lines if line.startswith("| **mrstrain** |")).replace("*", "").split("|")
     labelled = next(line for line in lines if line.startswith("| mrstrain with a label map |")).split("|")
-    pairs = re.findall(r"(fat|muscle|skin) (\.\d+) and (\.\d+)", CODE)
+    pairs = re.findall(r"(fat|muscle|skin) (\.\d+) and (\.\d+)", COMPARATOR)
     assert [(p[1], p[2]) for p in pairs] == [(plain[n].strip(), labelled[n].strip()) for n in (2, 3, 4)]
     limits = " ".join((ROOT / "docs" / "limits.md").read_text().split())
     assert MESH_DOUBT.removesuffix(" (Limitations)").split("fat lie")[1] in limits

@@ -17,7 +17,7 @@ from dvc.images.tissue import widened
 from dvc.measurement.error_bars import TwinCheck, error_bars
 from dvc.measurement.judgement import with_caution
 from dvc.measurement.page import error_tables
-from dvc.measurement.subject import Subject
+from dvc.measurement.subject import LabelsFromImage, Subject
 from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import load_preset
 from dvc.registration.engine import AlignedPair
@@ -64,6 +64,17 @@ def given(with_labels: bool = True, with_bone: bool = True):
 def bars_of(found, subject, maps, model, twin=None):
     found.noise = noise_of(found.reference, found.loaded, found.tissue)
     return error_bars(found, subject, maps, model, twin)
+
+
+def test_skin_of_a_label_map_from_the_image_has_no_intervals_and_the_reason_is_given() -> None:
+    """They held too few true values on phantoms; with a label map that a person made, they are given."""
+    found, subject, maps = given()
+    subject = replace(subject, labels=replace(subject.labels, names=NAMES | {2: "skin"}))
+    for made in (None, LabelsFromImage(0.1)):
+        bars = bars_of(found, replace(subject, from_image=made), maps, model())
+        assert {i.region for i in bars.uncertainty.intervals} == {"skin"}
+        assert all(np.isnan(i.low) == (made is not None) for i in bars.uncertainty.intervals)
+        assert ("No intervals in skin" in bars.explanation) == (made is not None)
 
 
 def test_every_bone_is_left_out_whatever_its_name() -> None:
