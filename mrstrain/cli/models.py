@@ -33,7 +33,8 @@ def mesh(
     out: Annotated[
         Path,
         typer.Option(
-            help="File name of the mesh, ending in .vtu; a .json, a .png and a .pdf of the same name are also written.",
+            help="File name of the mesh, ending in .vtu; a .json, a .png, a .pdf and a .log of the same name are also "
+            "written.",
             rich_help_panel="Output",
         ),
     ],

@@ -1,5 +1,6 @@
 """`level`: forward-model comparison (levelling), the measurement simulated on the displacement of a model."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -27,6 +28,7 @@ from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
 
+_log = logging.getLogger(__name__)
 _CHANGED_MM, _FEW = 0.1, 0.01
 
 
@@ -107,6 +109,7 @@ def level(
                 )  # fmt: skip
             except (RegistrationError, WorkerError) as failed:
                 failures.append(f"{load} could not be registered: {failed}")
+                _log.info("%s failed", load, exc_info=failed)
             else:
                 _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):

@@ -1,5 +1,6 @@
 """`register`: images in, a folder of strain maps and a report out; `register_one` is the part of it in a study."""
 
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -49,6 +50,7 @@ from mrstrain.records.inputs import (
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress
 
+_log = logging.getLogger(__name__)
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
 _BYTES_PER_VOXEL = 35  # of one image's results: 27 as measured, 5 with the plate's axes
 
@@ -255,7 +257,7 @@ class _Run:
     ) -> None:
         self.out, self.plan, self.images, self.start, self._tell = out, plan, images, start, tell
         self.cases: dict[str, Case] = {}
-        self.failures: dict[str, str] = {}
+        self.errors: dict[str, MrstrainError] = {}
         self._floor: NoiseFloor | None = None
         self._telling, self._writing = threading.Lock(), threading.Lock()
         self._floor_known = threading.Event()
@@ -285,7 +287,8 @@ class _Run:
                     self._floor = floor if is_repeat else self._floor
                     told("strain and figures", 1.0)
             except MrstrainError as error:
-                self.failures[name] = str(error)
+                self.errors[name] = error
+                _log.info("%s failed", name, exc_info=error)
             finally:
                 if is_repeat:
                     self._floor_known.set()
@@ -296,8 +299,14 @@ class _Run:
         """The loads that were registered, in the order given; RegistrationError where none was."""
         if not self.cases:
             reasons = [f"{name}: {reason}" for name, reason in self.failures.items()]
-            raise RegistrationError(with_reasons("No load could be registered.", reasons))
+            gravest = min(self.errors.values(), key=lambda error: isinstance(error, InputError))
+            raise RegistrationError(with_reasons("No load could be registered.", reasons)) from gravest
         return tuple(self.cases[name] for name in self.images if name in self.cases)
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why loads could not be registered."""
+        return {name: str(error) for name, error in self.errors.items()}
 
     def _told(self, case: str, stage: str, fraction: float) -> None:
         with self._telling:

@@ -1,5 +1,6 @@
 """`simulate`: a mesh under the loads of a plate, for one or more material sets."""
 
+import logging
 import re
 import tempfile
 import threading
@@ -33,6 +34,7 @@ LOADS = (
     fe.LoadStep("Load3", 15.0, 45.0), fe.LoadStep("Load4", 15.0, 12.0),
 )  # fmt: skip
 """Loads of the published experiment."""
+_log = logging.getLogger(__name__)
 _EVERY_S = 30.0  # smallest time between two checkpoints within a load
 
 
@@ -209,6 +211,7 @@ class _Run:
                     states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
             except MrstrainError as failure:
                 self.failures[case] = str(failure)
+                _log.info("%s failed", case, exc_info=failure)
                 self.crashed.add(id(problem))
                 self.died.update({case} if isinstance(failure, WorkerError) else ())
         with self.writing:

@@ -1,5 +1,6 @@
 """Progress for people: live bars with the time left in a terminal, a line now and then in a pipe."""
 
+import logging
 import math
 import re
 import sys
@@ -29,6 +30,7 @@ _LINE_EVERY_S = 15.0
 _LINE_OF_ALL_EVERY_S = 60.0
 _LEAST_SHARE = 0.02
 _NONE_LEFT = "about 0 s left"
+_log = logging.getLogger(__name__)
 _COUNTED = re.compile(r"(\d+) of \1\b.*")  # all that there are
 _MOST_SHARE = 0.99  # of what is not done: no line says 100 % while work goes on
 
@@ -41,9 +43,10 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
     shown from the start, and what a part found is printed when it has ended. Without a terminal there is a line for
     each part that has ended, and one every minute between.
     """
-    console = console or Console(stderr=True)
+    console, log = console or Console(stderr=True), _Logged(of_all)
 
     def shown(others: OnProgress, case: str, stage: str, fraction: float) -> None:
+        log(case, stage, fraction)
         if case == NOTE:
             console.print(stage, markup=False, highlight=False, soft_wrap=True)
         else:
@@ -58,6 +61,30 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
     except KeyboardInterrupt:
         console.print("Interrupted. Finished results are kept." + " The same command resumes." * of_all)
         raise
+
+
+class _Logged:
+    """Gives beginning and end of each stage to the logger, with its time; what a part found where ``of_all`` does."""
+
+    def __init__(self, of_all: bool) -> None:
+        self._of_all = of_all
+        self._began: dict[tuple[str, str], float] = {}
+        self._ended: set[tuple[str, str]] = set()
+
+    def __call__(self, case: str, stage: str, fraction: float) -> None:
+        """Take progress."""
+        if case == NOTE:
+            _log.info(stage)
+            return
+        key, now = (case, "" if self._of_all else stage), time.monotonic()
+        if case == ALL or key in self._ended:
+            return
+        if key not in self._began:
+            self._began[key] = now
+            _log.info("%s: %s", case, stage)
+        if fraction >= 1.0:
+            self._ended.add(key)
+            _log.info("%s: %s (ended after %.1f s)", case, stage, now - self._began[key])
 
 
 def duration(seconds: float) -> str:

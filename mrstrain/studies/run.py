@@ -3,9 +3,8 @@
 import logging
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from dvc.io.result_folder import REPORT
 from dvc.memory import hand_memory_back
 from dvc.threads import usable_cores
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
+from mrstrain.records.log import append, timed
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
 from mrstrain.studies.costs import CARE, costs, disk_bytes, expected, gib_of, sizes_of
@@ -255,6 +255,4 @@ def _alone(out: Path) -> Iterator[None]:
 
 
 def _log(path: Path, text: str) -> None:
-    """Append a line with the current time to a file; a line that a full disk does not take does not stop the run."""
-    with suppress(OSError), path.open("a", encoding="utf-8") as file:
-        file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S}Z {text}\n")
+    append(path, timed(text))

@@ -1,6 +1,7 @@
 """`accuracy`: error of a registration preset by tissue, position, strain, noise and resolution, on phantoms."""
 
 import hashlib
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -33,6 +34,7 @@ SEEDS = (1, 2)
 LABELS_OFF = (0, 1, -1)
 """Voxels by which bones and skin are too large in the label maps, in turn, for the engine that relies on them."""
 
+_log = logging.getLogger(__name__)
 _MEGABYTES = 8.0  # measured for one run's samples at 0.8 mm
 
 
@@ -179,6 +181,7 @@ def _measure_all(
             runs[case.name] = samples
         except MrstrainError as error:
             failures[case.name] = str(error)
+            _log.info("%s failed", case.name, exc_info=error)
         report(case.name, 1.0)
 
     each_in_workers(cases, measure_one, at_once=at_once, threads=1)
