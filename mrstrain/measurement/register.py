@@ -38,6 +38,7 @@ from mrstrain.options.measurement import (
     SubjectFiles,
 )
 from mrstrain.options.model import Flag
+from mrstrain.records.durations import LABELS, REPORT, WRITING, registrations
 from mrstrain.records.inputs import (
     alone,
     case_names,
@@ -48,7 +49,8 @@ from mrstrain.records.inputs import (
     refuse_touching_inputs,
 )
 from mrstrain.records.outcome import with_reasons
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import OnProgress, expect
+from mrstrain.records.time_left import FAILED
 
 _log = logging.getLogger(__name__)
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
@@ -111,12 +113,16 @@ def register(
         first = worker or stack.enter_context(Worker(threads))
         first.start(align_images.__module__, type(chosen).__module__)
         images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
+        to_label = subject_files.labels == AUTO
+        seen = float(np.prod(images[cases[0]].grid.shape))  # about as many voxels as the unloaded image has
+        how_long = registrations(cases, chosen.cost, seen, twin=registration.twin, label_first=to_label)
+        expect(progress, how_long, at_once)
         # Read now: what is wrong with it must not be found after an hour.
         model = None if registration.error_model is None else read_error_model(registration.error_model)
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
-        if subject_files.labels == AUTO:
+        if to_label:
             _hold(target, stack)
-            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
+            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, LABELS, "tissues"))
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         subject = replace(subject, tissue=subject.body())
         # Its rigid motion is found by aligning.
@@ -142,9 +148,12 @@ def register(
             _hold(target, stack)
         run.all(at_once, registration.chain, first)
         finished = run.finished()
+    tell(REPORT, WRITING, 0.0)
     shown = [case for case in finished if case.name != REPEAT]
     answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
-    return Series.of(target, finished, run.failures, record, answer, of_labels)
+    series = Series.of(target, finished, run.failures, record, answer, of_labels)
+    tell(REPORT, WRITING, 1.0)
+    return series
 
 
 def _hold(out: Path, stack: ExitStack) -> None:
@@ -289,6 +298,7 @@ class _Run:
             except MrstrainError as error:
                 self.errors[name] = error
                 _log.info("%s failed", name, exc_info=error)
+                told(FAILED, 1.0)
             finally:
                 if is_repeat:
                     self._floor_known.set()

@@ -24,9 +24,10 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
+from mrstrain.records.durations import PathSize, simulations
 from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
-from mrstrain.records.progress import NOTE, OnProgress
+from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.provenance import provenance
 
 LOADS = (
@@ -118,6 +119,8 @@ def simulate(
     at_once = max(1, min(cores.workers or usable_cores(), len(jobs)))
     each = cores.threads or max(1, usable_cores() // at_once)
     options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
+    sizes = {path_name(one, path.loads): PathSize(one, len(path.loads), len(path.passed)) for one, path in jobs}
+    expect(progress, simulations(sizes, len(read.cells), simulation.element, limit_s), at_once)
     run = _Run(target, loads, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
     with ExitStack() as held_folders:
         for folder in (target / one.name for one in chosen):
@@ -131,6 +134,11 @@ def simulate(
         kind = WorkerError if run.died == run.failures.keys() else MrstrainError
         raise kind(with_reasons("Every simulation failed.", [f"{n}: {r}" for n, r in run.failures.items()]))
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
+
+
+def path_name(one: fe.MaterialSet, loads: Sequence[fe.LoadStep]) -> str:
+    """The name of a load path with a material set."""
+    return f"{one.name}, {' '.join(step.name for step in loads)}"
 
 
 def _remove_earlier(folder: Path, loads: Collection[str]) -> None:
@@ -197,7 +205,7 @@ class _Run:
 
     def path(self, chosen: fe.MaterialSet, problem: fe.Problem, options: fe.SolverOptions, worker: Worker) -> None:
         """Solve one path."""
-        case = f"{chosen.name}, {' '.join(step.name for step in problem.loads)}"
+        case = path_name(chosen, problem.loads)
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
             share, place, what = Path(folder) / "share", self.target / chosen.name, f"simulating {case}"
 

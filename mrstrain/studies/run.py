@@ -16,6 +16,7 @@ from dvc.threads import usable_cores
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.log import append, timed
 from mrstrain.records.progress import ALL, OnProgress
+from mrstrain.records.time_left import Expected, TimeLeft, seconds_to_end
 from mrstrain.studies.check import wrong_with
 from mrstrain.studies.costs import CARE, costs, disk_bytes, expected, gib_of, sizes_of
 from mrstrain.studies.file import Study, read_study
@@ -23,7 +24,6 @@ from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
 from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, left_out_of, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
-from mrstrain.studies.time_left import Expected, TimeLeft, seconds_to_end
 from mrstrain.studies.watch import Follower, OnReport, Report, Watch
 
 LOG = "study.log"

@@ -19,6 +19,7 @@ Tell = Callable[[str, float], None]
 _PARTS = {
     "aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2),
     "reading": (0.0, 0.1), "comparing": (0.1, 0.5), "writing": (0.6, 0.4),
+    "meshing": (0.0, 1.0),
 }  # fmt: skip
 # of the time of a registration or a comparison: when each of its parts begins, and how much of it the part takes
 _LEFT_OUT = (
@@ -80,14 +81,16 @@ def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any
     from mrstrain.models.mesh import mesh as run, mesh_coarser
     from mrstrain.options.modelling import Labelling, Meshing
 
-    def watch(share: float) -> None:
-        tell("meshing", share)
+    whole = _whole(tell)
+
+    def told(_: str, part: str, fraction: float) -> None:
+        whole(part, fraction)
 
     if ratio is None:
-        lines = run(labels, watch=watch, **options).summary()
+        lines = run(labels, progress=told, **options).summary()
     else:
         how, which = _chosen(Meshing, options), _chosen(Labelling, options)
-        lines = mesh_coarser(labels, ratio=ratio, labelling=which, meshing=how, watch=watch, **options).summary()
+        lines = mesh_coarser(labels, ratio=ratio, labelling=which, meshing=how, progress=told, **options).summary()
     return StageResult(tuple(lines), headline=lines[0])
 
 

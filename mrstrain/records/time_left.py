@@ -1,14 +1,20 @@
-"""How long a run still takes: what its stages are expected to take, corrected by how long the others took."""
+"""How long a run still takes: what its stages are expected to take, corrected by how long they took so far.
+
+Stages are those of a study, or the parts of a command that may run at the same time, such as the loads of `register`.
+"""
 
 import time
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Self
 
 _TRUST_S = 15.0  # the expectation counts as if so many seconds of stages had ended just as expected
+_TRUST = 0.1  # of a command, which may be over sooner: as if this fraction of it had
 _ALIKE_S = 80.0  # the pace of all kinds counts as if so many seconds of stages of one kind had ended at that pace
 _OVERDUE = 0.25  # of the time that a stage has taken already, where it should have ended
+FAILED = "failed"
+"""The last part of a stage that ends by an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +25,24 @@ class Expected:
     cores: int = 1
     before: tuple[str, ...] = ()
     kind: str = ""  # stages of one kind are as much faster or slower than expected as one another
+    parts: Mapping[str, float] = field(default_factory=dict)  # seconds of each, in their order, where it has several
+
+    @classmethod
+    def of(cls, parts: Mapping[str, float], **more: Any) -> Self:
+        """What parts of a stage, one after another, are expected to take."""
+        return cls(sum(parts.values()), parts=parts, **more)
+
+    def share(self, part: str, fraction: float) -> float:
+        """How much of the expected time has passed where a fraction of a part is done; 0 for an unknown part."""
+        if part == FAILED:
+            return 1.0
+        if not self.parts:
+            return fraction
+        if part not in self.parts:
+            return 0.0
+        before = list(self.parts)[: list(self.parts).index(part)]
+        done = sum(self.parts[name] for name in before) + fraction * self.parts[part]
+        return done / self.seconds if fraction < 1.0 or part != list(self.parts)[-1] else 1.0
 
     def after(self, prefix: str) -> Self:
         """The same, waiting for stages whose names begin with a prefix."""
@@ -45,11 +69,13 @@ def seconds_to_end(stages: Mapping[str, Expected], left: Mapping[str, float] | N
 class Pace:
     """Time that stages take over what they were expected to, for each kind of stage.
 
-    With t and e the sums of the time taken and expected: of all kinds together p = (T + t) / (T + e), T = 15 s, near 1
-    while little has ended; of one kind (A p + t_kind) / (A + e_kind), A = 80 s, near p while little of it has ended. A
-    slow machine slows down every kind, but fast registrations hardly promise fast simulations.
+    With t and e the sums of the time taken and expected: of all kinds together p = (T + t) / (T + e), T = 15 s (of a
+    command: a tenth of what is expected), near 1 while little has ended; of one kind (A p + t_kind) / (A + e_kind),
+    A = 80 s (5.3 T), near p while little of it has ended. A slow machine slows down every kind, but fast registrations
+    hardly promise fast simulations.
     """
 
+    trust_s: float = _TRUST_S
     taken: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
     expected: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
@@ -60,8 +86,9 @@ class Pace:
 
     def of(self, stage: Expected) -> float:
         """The pace of the kind of a stage."""
-        of_all = (_TRUST_S + sum(self.taken.values())) / (_TRUST_S + sum(self.expected.values()))
-        return (_ALIKE_S * of_all + self.taken.get(stage.kind, 0.0)) / (_ALIKE_S + self.expected.get(stage.kind, 0.0))
+        of_all = (self.trust_s + sum(self.taken.values())) / (self.trust_s + sum(self.expected.values()))
+        alike_s = self.trust_s * _ALIKE_S / _TRUST_S
+        return (alike_s * of_all + self.taken.get(stage.kind, 0.0)) / (alike_s + self.expected.get(stage.kind, 0.0))
 
 
 @dataclass(slots=True)
@@ -70,8 +97,15 @@ class TimeLeft:
 
     stages: Mapping[str, Expected]  # in an order in which each stands after those that it waits for
     workers: int
+    trust_s: float = _TRUST_S
     began: dict[str, float] = field(default_factory=dict)
     took: dict[str, float] = field(default_factory=dict)
+    reached: dict[str, tuple[float, float]] = field(default_factory=dict)  # share of a stage, and when it was reached
+
+    @classmethod
+    def of_command(cls, stages: Mapping[str, Expected], workers: int) -> Self:
+        """The time left of a command with such parts."""
+        return cls(stages, workers, _TRUST * sum(one.seconds for one in stages.values()))
 
     def begin(self, name: str) -> None:
         """Note that a stage has begun; again if it was begun anew."""
@@ -81,6 +115,17 @@ class TimeLeft:
         """Note that a stage has ended, or will never begin."""
         now = time.monotonic()
         self.took[name] = now - self.began.setdefault(name, now)
+
+    def told(self, name: str, part: str, fraction: float) -> None:
+        """Take the progress of a stage that tells how far it is; others are left out."""
+        if name not in self.stages or name in self.took:
+            return
+        self.begin(name)
+        share = self.stages[name].share(part, fraction)
+        if share >= 1.0:
+            self.end(name)
+        elif share > self.reached.get(name, (0.0, 0.0))[0]:
+            self.reached[name] = share, time.monotonic()
 
     @property
     def under_way(self) -> list[str]:
@@ -92,22 +137,26 @@ class TimeLeft:
         now = time.monotonic()
         spent = {name: now - self.began[name] for name in self.under_way}
         pace = self._pace(spent)
-        left = {
-            name: max(pace.of(one) * one.seconds - spent.get(name, 0.0), _OVERDUE * spent.get(name, 0.0))
-            for name, one in self.stages.items()
-            if name not in self.took
-        }
+        left = {}
+        for name, one in self.stages.items():
+            if name not in self.took:
+                share, at = self.reached.get(name, (0.0, self.began.get(name, now)))
+                left[name] = max(pace.of(one) * one.seconds * (1.0 - share) - (now - at), _OVERDUE * (now - at))
         workers = max(self.workers, len(spent))  # a cluster may have more
         work = sum(seconds * min(self.stages[name].cores, workers) for name, seconds in left.items())
         return max([work / workers, *seconds_to_end(self.stages, left).values()])
 
     def _pace(self, spent: Mapping[str, float]) -> Pace:
-        """The pace of the stages that have ended; one under way counts as soon as it takes longer, as overdue."""
-        pace = Pace()
+        """The pace of what has ended; a stage under way counts as far as it told, or if it is overdue."""
+        pace = Pace(self.trust_s)
         for name, taken in self.took.items():
             if taken > 0.0:  # others never began
                 pace.add(self.stages[name], taken)
+        for name, (share, at) in self.reached.items():
+            if name not in self.took:
+                one = self.stages[name]
+                pace.add(replace(one, seconds=share * one.seconds), at - self.began[name])
         for name, so_far in spent.items():
-            if so_far > pace.of(self.stages[name]) * self.stages[name].seconds:
+            if name not in self.reached and so_far > pace.of(self.stages[name]) * self.stages[name].seconds:
                 pace.add(self.stages[name], (1.0 + _OVERDUE) * so_far)
         return pace
