@@ -24,7 +24,7 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
-from mrstrain.records.durations import PathSize, simulations
+from mrstrain.records.durations import PASSED, WRITING, PathSize, figures_of, simulations
 from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import NOTE, OnProgress, expect
@@ -141,6 +141,13 @@ def path_name(one: fe.MaterialSet, loads: Sequence[fe.LoadStep]) -> str:
     return f"{one.name}, {' '.join(step.name for step in loads)}"
 
 
+def _share(problem: fe.Problem, loads_done: float) -> float:
+    """How much of the time of a path has passed where a fraction of all its loads is done, passed ones included."""
+    own, passed = len(problem.loads), len(problem.passed)
+    done = loads_done * (own + passed)
+    return (PASSED * min(done, passed) + max(done - passed, 0.0)) / (own + PASSED * passed)
+
+
 def _remove_earlier(folder: Path, loads: Collection[str]) -> None:
     """Remove the results of an earlier simulation; checkpoints of the current loads are kept."""
     fe.begin_simulation(folder)
@@ -211,7 +218,7 @@ class _Run:
 
             def watch() -> None:
                 if share.exists():
-                    self.progress(case, "simulating", float(share.read_text() or 0.0))
+                    self.progress(case, "simulating", _share(problem, float(share.read_text() or 0.0)))
 
             states: list[fe.LoadState] = []
             try:
@@ -225,9 +232,11 @@ class _Run:
         with self.writing:
             self.ended[id(problem)] = states
             problems = [one for other, one in self.jobs if other is chosen]
+            self.progress(case, "simulating", 1.0)
             if all(id(one) in self.ended for one in problems):
+                self.progress(figures_of(chosen.name), WRITING, 0.0)
                 self._write(chosen, problems)
-        self.progress(case, "simulating", 1.0)
+                self.progress(figures_of(chosen.name), WRITING, 1.0)
 
     def _passed_in_vain(self, chosen: fe.MaterialSet, problem: fe.Problem) -> bool:
         """Whether another path has ended without equilibrium under a load that this one passes."""

@@ -21,8 +21,9 @@ MESHING, WRITING = "meshing", "writing"
 # From 13 recorded demonstrations on two idle cores (2.3 million voxels; 35,000 or 80,000 cells, four loads), and from
 # registrations of 0.3 to 17 million voxels (benchmarks/results/register_scaling.json). Of a registration beside its
 # engine (`Cost`): whatever the size, and for each million voxels.
-_ALIGN_S, _ALIGN_S_PER_MVOXEL = 4.0, 0.5
-_MAPS_S, _MAPS_S_PER_MVOXEL = 4.0, 1.0
+_ALIGN_S, _ALIGN_S_PER_MVOXEL = 2.0, 0.8
+_ENGINE_S = 2.5
+_MAPS_S, _MAPS_S_PER_MVOXEL = 3.5, 0.7
 _TWIN = 1.3  # additional time, relative: the synthetic warp is made and registered
 _MAKING = 0.3  # of it to make the warp
 _CELLS, _LOAD_S, _GROWTH = 80e3, 12.0, 1.5  # a load of the set trebbi
@@ -41,9 +42,14 @@ _SOFT_MPA, _SOFTER = 0.03, 0.4  # of other sets, by their softest tissue: for pu
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _MESH_S, _MESH_S_PER_CELL = 4.0, 0.54e-3
 _COMPARE_S, _MODEL_S = 1.0, 5.1  # each load: of it, and of each of its models
-_START_S, _PASSED = 2.0, 0.3  # of a path: beside its loads, and a load that it passes over one of its own
+_START_S = 2.0  # of a load path, beside its loads
+PASSED = 0.3
+"""Time of a load that a load path passes, over one of its own."""
+_FIGURES_S = 2.0  # of a material set
 _LABEL_S_PER_MVOXEL = 5.0
-_REPORT_S, _ACCURACY_REPORT_S, _MESH_WRITING_S = 1.0, 6.0, 2.0
+_REPORT_S, _ACCURACY_REPORT_S, _MESH_WRITING_S = 1.0, 2.0, 2.0
+# The time that a `Cost` has for a phantom is that at 0.8 mm; a part of it does not depend on the voxels.
+_PHANTOM, _PHANTOM_VOXEL_MM3 = 0.2, 0.512
 _COMPARE_PARTS = {"reading": 0.1, "comparing": 0.5, "writing": 0.4}  # of its time
 # Cells fill the volume (`_SHAPE`: their volume over their edge cubed) and line the surfaces of tissues: heels of 35,000
 # and 79,500 cells (label maps of 1.2 and 0.8 mm, edges of 4 and 2.8 mm) should have 33,000 and 83,000.
@@ -77,10 +83,17 @@ def simulations(
     """Load paths on a mesh of so many cells, by name, each for at most ``limit_s``."""
     expected: dict[str, Expected] = {}
     for name, path in paths.items():
-        solving = (path.loads + _PASSED * path.passed) * load_s(cells, element, path.material)
+        solving = (path.loads + PASSED * path.passed) * load_s(cells, element, path.material)
         seconds = _START_S + (solving if limit_s is None else min(solving, limit_s))
         expected[name] = Expected(seconds, kind=path.material.name)
-    return expected
+    sets = dict.fromkeys(path.material.name for path in paths.values())
+    of_set = {one: tuple(name for name, path in paths.items() if path.material.name == one) for one in sets}
+    return expected | {figures_of(one): Expected(_FIGURES_S, before=of_set[one]) for one in sets}
+
+
+def figures_of(material: str) -> str:
+    """The case in which tables and figures of a material set are written."""
+    return f"{material}, figures"
 
 
 def comparison(models: Sequence[int], at_once: int) -> Expected:
@@ -88,14 +101,19 @@ def comparison(models: Sequence[int], at_once: int) -> Expected:
     return Expected.of({name: part_s / at_once for name, part_s in comparison_s(models).items()})
 
 
-def accuracy_runs(what: str, costs: Iterable[Cost], at_once: int) -> Expected:
-    """Phantoms that are made, registered and scored with engines of these costs, and the report."""
-    return Expected.of({what: sum(cost.phantom_seconds for cost in costs) / at_once, REPORT: _ACCURACY_REPORT_S})
+def phantom_s(cost: Cost, voxel_mm3: float) -> float:
+    """Time to make, register and score a phantom with voxels of this volume."""
+    return float(cost.phantom_seconds) * (_PHANTOM + (1.0 - _PHANTOM) * _PHANTOM_VOXEL_MM3 / voxel_mm3)
+
+
+def accuracy_runs(what: str, runs_s: float) -> Expected:
+    """Phantoms that take so long together, and the report."""
+    return Expected.of({what: runs_s, REPORT: _ACCURACY_REPORT_S})
 
 
 def meshing(cells: float) -> Expected:
     """A mesh of so many cells."""
-    return Expected.of({MESHING: mesh_s(cells) - _MESH_WRITING_S, WRITING: _MESH_WRITING_S})
+    return Expected.of({MESHING: mesh_s(cells) - _MESH_WRITING_S, WRITING: _MESH_WRITING_S}, guessed=(MESHING,))
 
 
 def registration_s(cost: Cost, voxels: float, *, twin: bool = False) -> dict[str, float]:
@@ -105,7 +123,7 @@ def registration_s(cost: Cost, voxels: float, *, twin: bool = False) -> dict[str
     """
     mvoxels = voxels / 1e6
     aligning = _ALIGN_S + _ALIGN_S_PER_MVOXEL * mvoxels
-    registering = cost.seconds + cost.seconds_per_mvoxel * mvoxels
+    registering = _ENGINE_S + cost.seconds + cost.seconds_per_mvoxel * mvoxels
     maps = _MAPS_S + _MAPS_S_PER_MVOXEL * mvoxels
     parts = {"aligning": aligning, "registering": registering}
     if twin:

@@ -64,11 +64,15 @@ class CommandLog(logging.Handler):
         text = record.getMessage()
         if record.exc_info and record.exc_info[1] is not None:
             text += "\n" + "".join(traceback.format_exception(record.exc_info[1])).rstrip()
-        lines = timed(_ELSEWHERE.sub("", without_places(text, self._places)))
+        lines = timed(self.impersonal(text))
         if self.begun:
             append(self.place, lines)
         else:
             self._waiting += lines
+
+    def impersonal(self, text: str) -> str:
+        """A text without the folders of its paths."""
+        return _ELSEWHERE.sub("", without_places(text, self._places))
 
     def begin(self) -> None:
         """Write what has been kept so far."""
@@ -103,7 +107,7 @@ def logged(out: Path, typed: Sequence[str], *, one_file: bool = False) -> Iterat
         logger.setLevel(logging.INFO)
     logging.captureWarnings(True)
     try:
-        _log.info("mrstrain %s: %s", __version__, shlex.join(typed))
+        _log.info("mrstrain %s: %s", __version__, shlex.join(map(log.impersonal, typed)))
         yield log
         _log.info("Finished after %.1f s", time.monotonic() - began)
     except BaseException as error:

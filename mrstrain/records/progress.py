@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from mrstrain.records.time_left import Expected, TimeLeft
+from mrstrain.records.time_left import STARTING, Expected, TimeLeft
 
 OnProgress = Callable[[str, str, float], None]
 """``progress(case, stage, fraction)``: what is being done for which case, and how far it is (0 to 1).
@@ -57,12 +57,14 @@ class Live:
         self._show, self._log, self._began = show, log, time.monotonic()
         self._left: TimeLeft | None = None
         self._parts: dict[str, str] = {}  # of the cases under way
+        self._under_way = STARTING
         self._telling, self._stop = threading.Lock(), threading.Event()
 
     def expect(self, cases: Mapping[str, Expected], workers: int) -> None:
         """As `mrstrain.records.progress.expect`."""
         if self._left is None:
-            self._left = TimeLeft.of_command(cases, workers)
+            self._left = TimeLeft.of_command(cases, workers, time.monotonic() - self._began)
+            self.tell()
             threading.Thread(target=self._keep_up, name="time left", daemon=True).start()
 
     def __call__(self, case: str, stage: str, fraction: float) -> None:
@@ -81,10 +83,11 @@ class Live:
     def tell(self) -> None:
         """Show the whole: what is under way, and the share of the time, spent and left, that is spent."""
         with self._telling:
-            if self._left is not None and self._parts:
+            if self._left is not None:
                 spent = time.monotonic() - self._began
                 told = "; ".join(f"{case}: {part}" for case, part in self._parts.items())
-                self._show(ALL, told, min(spent / (spent + self._left.seconds() + 1e-9), _UNENDED))
+                self._under_way = told or self._under_way  # between two of them, as before
+                self._show(ALL, self._under_way, min(spent / (spent + self._left.seconds() + 1e-9), _UNENDED))
 
     def close(self) -> None:
         """Show that the whole has ended, and no more."""
@@ -189,8 +192,7 @@ def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
     columns = name, BarColumn(), percentage, TimeElapsedColumn(), _TimeLeft()
     with Progress(*columns, console=console) as display:
         stages: dict[str, str] = {}
-        if of_all:
-            bars[ALL] = display.add_task(ALL, total=1.0)
+        bars[ALL] = display.add_task(ALL, total=1.0, visible=of_all)  # its clock begins now
 
         def progress(case: str, stage: str, fraction: float) -> None:
             visible = case == ALL or fraction < 1.0

@@ -13,6 +13,10 @@ _TRUST_S = 15.0  # the expectation counts as if so many seconds of stages had en
 _TRUST = 0.1  # of a command, which may be over sooner: as if this fraction of it had
 _ALIKE_S = 80.0  # the pace of all kinds counts as if so many seconds of stages of one kind had ended at that pace
 _OVERDUE = 0.25  # of the time that a stage has taken already, where it should have ended
+_STARTING_S = 1.5  # of a command, before its stages are known
+
+STARTING = "starting"
+"""The stage of a command before its stages are known."""
 FAILED = "failed"
 """The last part of a stage that ends by an error."""
 
@@ -26,6 +30,7 @@ class Expected:
     before: tuple[str, ...] = ()
     kind: str = ""  # stages of one kind are as much faster or slower than expected as one another
     parts: Mapping[str, float] = field(default_factory=dict)  # seconds of each, in their order, where it has several
+    guessed: tuple[str, ...] = ()  # parts that tell no more than how much of what they expect has passed
 
     @classmethod
     def of(cls, parts: Mapping[str, float], **more: Any) -> Self:
@@ -40,6 +45,8 @@ class Expected:
             return fraction
         if part not in self.parts:
             return 0.0
+        if part in self.guessed:
+            fraction = float(fraction >= 1.0)
         before = list(self.parts)[: list(self.parts).index(part)]
         done = sum(self.parts[name] for name in before) + fraction * self.parts[part]
         return done / self.seconds if fraction < 1.0 or part != list(self.parts)[-1] else 1.0
@@ -100,12 +107,16 @@ class TimeLeft:
     trust_s: float = _TRUST_S
     began: dict[str, float] = field(default_factory=dict)
     took: dict[str, float] = field(default_factory=dict)
-    reached: dict[str, tuple[float, float]] = field(default_factory=dict)  # share of a stage, and when it was reached
+    # Of a stage under way: the share that it has reached, when, and the share at the end of its part.
+    reached: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     @classmethod
-    def of_command(cls, stages: Mapping[str, Expected], workers: int) -> Self:
-        """The time left of a command with such parts."""
-        return cls(stages, workers, _TRUST * sum(one.seconds for one in stages.values()))
+    def of_command(cls, stages: Mapping[str, Expected], workers: int, starting_s: float) -> Self:
+        """The time left of a command with such parts, which took so long to start; a busy machine is slow then, too."""
+        trust_s = _TRUST * sum(one.seconds for one in stages.values())
+        return cls(
+            {STARTING: Expected(_STARTING_S), **stages}, workers, trust_s, {STARTING: 0.0}, {STARTING: starting_s}
+        )
 
     def begin(self, name: str) -> None:
         """Note that a stage has begun; again if it was begun anew."""
@@ -124,8 +135,8 @@ class TimeLeft:
         share = self.stages[name].share(part, fraction)
         if share >= 1.0:
             self.end(name)
-        elif share > self.reached.get(name, (0.0, 0.0))[0]:
-            self.reached[name] = share, time.monotonic()
+        elif name not in self.reached or share > self.reached[name][0]:
+            self.reached[name] = share, time.monotonic(), self.stages[name].share(part, 1.0)
 
     @property
     def under_way(self) -> list[str]:
@@ -140,7 +151,7 @@ class TimeLeft:
         left = {}
         for name, one in self.stages.items():
             if name not in self.took:
-                share, at = self.reached.get(name, (0.0, self.began.get(name, now)))
+                share, at, _ = self.reached.get(name, (0.0, self.began.get(name, now), 1.0))
                 left[name] = max(pace.of(one) * one.seconds * (1.0 - share) - (now - at), _OVERDUE * (now - at))
         workers = max(self.workers, len(spent))  # a cluster may have more
         work = sum(seconds * min(self.stages[name].cores, workers) for name, seconds in left.items())
@@ -152,11 +163,14 @@ class TimeLeft:
         for name, taken in self.took.items():
             if taken > 0.0:  # others never began
                 pace.add(self.stages[name], taken)
-        for name, (share, at) in self.reached.items():
-            if name not in self.took:
-                one = self.stages[name]
-                pace.add(replace(one, seconds=share * one.seconds), at - self.began[name])
-        for name, so_far in spent.items():
-            if name not in self.reached and so_far > pace.of(self.stages[name]) * self.stages[name].seconds:
-                pace.add(self.stages[name], (1.0 + _OVERDUE) * so_far)
+        for name in spent.keys() & self.reached.keys():
+            one, (share, at, end) = self.stages[name], self.reached[name]
+            overdue = spent[name] - (at - self.began[name]) > pace.of(one) * (end - share) * one.seconds
+            taken = at - self.began[name]
+            if overdue:  # it may be at the end of its part, but not beyond
+                share, taken = end, spent[name] * (1.0 if end < 1.0 else 1.0 + _OVERDUE)
+            pace.add(replace(one, seconds=share * one.seconds), taken)
+        for name in spent.keys() - self.reached.keys():
+            if spent[name] > pace.of(self.stages[name]) * self.stages[name].seconds:
+                pace.add(self.stages[name], (1.0 + _OVERDUE) * spent[name])
         return pace

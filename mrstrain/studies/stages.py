@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from dvc import Verdict
 from dvc.report.page import Section
 from mrstrain.options.model import Options
+from mrstrain.records.durations import WRITING
 from mrstrain.records.progress import NOTE
 
 _M = TypeVar("_M", bound=Options)
@@ -108,7 +109,7 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
     begun: dict[str, float] = {}
 
     def told(case: str, stage: str, fraction: float) -> None:
-        if case == NOTE:  # is in the summary, too
+        if case == NOTE or stage == WRITING:  # a note is in the summary, too
             return
         begun[case] = fraction
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))

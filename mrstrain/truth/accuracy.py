@@ -16,7 +16,7 @@ from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.threads import usable_cores
 from dvc.worker import Worker, each_in_workers
-from mrstrain.records.durations import REPORT, accuracy_runs
+from mrstrain.records.durations import REPORT, accuracy_runs, phantom_s
 from mrstrain.records.inputs import alone, output_folder, refuse_small_disk
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress, expect
@@ -62,7 +62,9 @@ def accuracy_cases(
 
 def expected_minutes(cases: Sequence[AccuracyCase], workers: int) -> float:
     """Estimated time of the cases with so many ``workers``, minutes."""
-    return sum(engine_named(case.preset).cost.phantom_seconds for case in cases) / workers / 60.0
+    voxels_mm3 = [float(np.prod(case.spacing_mm)) for case in cases]
+    runs = zip(cases, voxels_mm3, strict=True)
+    return sum(phantom_s(engine_named(case.preset).cost, voxel) for case, voxel in runs) / workers / 60.0
 
 
 def accuracy(
@@ -117,8 +119,7 @@ def accuracy(
         )
     with output_folder(folder), alone(target):
         if missing:
-            costs = [engine_named(case.preset).cost for case in missing]
-            expect(progress, {_CASE: accuracy_runs(_named(missing), costs, at_once)})
+            expect(progress, {_CASE: accuracy_runs(_named(missing), 60.0 * expected_minutes(missing, at_once))})
         tell = progress or (lambda *_: None)
         failures = _measure_all(missing, at_once, folder, runs, tell)
         if not runs:

@@ -50,7 +50,9 @@ def test_every_command_that_writes_results_has_a_log_beside_them(name, tmp_path,
     told = (tmp_path / place).read_text().splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ ", line) for line in told)
     said = [line.partition(" ")[2] for line in told]
-    assert said[0] == f"mrstrain {mrstrain.__version__}: mrstrain {name} {' '.join(typed)}"
+    assert (
+        said[0] == f"mrstrain {mrstrain.__version__}: mrstrain {name} {' '.join(word.split('/')[-1] for word in typed)}"
+    )
     assert said[1] == "what was found"
     assert re.fullmatch(r"Finished after \d+\.\d s", said[2])
 

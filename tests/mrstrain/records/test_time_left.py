@@ -231,7 +231,7 @@ def test_a_stage_that_tells_how_far_it_is_needs_no_end_to_correct_the_pace(clock
     assert one.share("strain and figures", 1.0) == one.share(FAILED, 1.0) == 1.0
     assert one.share("reading", 1.0) == 0.0  # unknown
     assert Expected(5.0).share("simulating", 0.3) == 0.3
-    left = TimeLeft.of_command({"Load1": one, "Load2": one}, 1)
+    left = TimeLeft.of_command({"Load1": one, "Load2": one}, 1, 1.5)
     for second, part, fraction in ((0.0, "aligning", 0.0), (30.0, "aligning", 1.0), (30.0, "registering", 0.0)):
         clock[0] = second
         left.told("Load1", part, fraction)
