@@ -24,11 +24,12 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
-from mrstrain.records.durations import PASSED, WRITING, PathSize, figures_of, simulations
+from mrstrain.records.durations import PASSED, SIMULATING, WRITING, PathSize, figures_of, simulations
 from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.provenance import provenance
+from mrstrain.records.time_left import STARTING
 
 LOADS = (
     fe.LoadStep("Load1", 140.0), fe.LoadStep("Load2", 15.0),
@@ -218,11 +219,12 @@ class _Run:
 
             def watch() -> None:
                 if share.exists():
-                    self.progress(case, "simulating", _share(problem, float(share.read_text() or 0.0)))
+                    self.progress(case, SIMULATING, _share(problem, float(share.read_text() or 0.0)))
 
             states: list[fe.LoadState] = []
             try:
                 if not self._passed_in_vain(chosen, problem):
+                    self.progress(case, STARTING, 0.0)
                     states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
             except MrstrainError as failure:
                 self.failures[case] = str(failure)
@@ -232,7 +234,7 @@ class _Run:
         with self.writing:
             self.ended[id(problem)] = states
             problems = [one for other, one in self.jobs if other is chosen]
-            self.progress(case, "simulating", 1.0)
+            self.progress(case, SIMULATING, 1.0)
             if all(id(one) in self.ended for one in problems):
                 self.progress(figures_of(chosen.name), WRITING, 0.0)
                 self._write(chosen, problems)

@@ -9,14 +9,14 @@ from dvc import LabelMap
 from dvc.arrays import BoolArray, IntArray
 from dvc.registration.engine import Cost
 from fe import MaterialSet
-from mrstrain.records.time_left import Expected
+from mrstrain.records.time_left import STARTING, Expected
 
 LABELS = "labels"
 """The case of the label map that `register` makes."""
 REPORT = "report"
 """The case, or the last part of one, in which tables, figures and the report of a command are written."""
-MESHING, WRITING = "meshing", "writing"
-"""Parts of a mesh."""
+MESHING, SIMULATING, WRITING = "meshing", "simulating", "writing"
+"""Parts of a mesh and of a simulation."""
 
 # From 13 recorded demonstrations on two idle cores (2.3 million voxels; 35,000 or 80,000 cells, four loads), and from
 # registrations of 0.3 to 17 million voxels (benchmarks/results/register_scaling.json). Of a registration beside its
@@ -42,7 +42,7 @@ _SOFT_MPA, _SOFTER = 0.03, 0.4  # of other sets, by their softest tissue: for pu
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _MESH_S, _MESH_S_PER_CELL = 4.0, 0.54e-3
 _COMPARE_S, _MODEL_S = 1.0, 5.1  # each load: of it, and of each of its models
-_START_S = 2.0  # of a load path, beside its loads
+_START_S = 3.0  # of a load path, beside its loads
 PASSED = 0.3
 """Time of a load that a load path passes, over one of its own."""
 _FIGURES_S = 2.0  # of a material set
@@ -84,8 +84,8 @@ def simulations(
     expected: dict[str, Expected] = {}
     for name, path in paths.items():
         solving = (path.loads + PASSED * path.passed) * load_s(cells, element, path.material)
-        seconds = _START_S + (solving if limit_s is None else min(solving, limit_s))
-        expected[name] = Expected(seconds, kind=path.material.name)
+        parts = {STARTING: _START_S, SIMULATING: solving if limit_s is None else min(solving, limit_s)}
+        expected[name] = Expected.of(parts, kind=path.material.name)
     sets = dict.fromkeys(path.material.name for path in paths.values())
     of_set = {one: tuple(name for name, path in paths.items() if path.material.name == one) for one in sets}
     return expected | {figures_of(one): Expected(_FIGURES_S, before=of_set[one]) for one in sets}

@@ -235,8 +235,8 @@ def test_a_stage_that_tells_how_far_it_is_needs_no_end_to_correct_the_pace(clock
     for second, part, fraction in ((0.0, "aligning", 0.0), (30.0, "aligning", 1.0), (30.0, "registering", 0.0)):
         clock[0] = second
         left.told("Load1", part, fraction)
-    # a third as fast: (T + 30) / (T + 10) with T = 10 s, then once more for the kind, with 5.3 T
-    assert left.seconds() == pytest.approx(90.0 * (53.3 * 2.0 + 30.0) / (53.3 + 10.0), rel=0.01)
+    # a third as fast, (T + 31.5) / (T + 11.5) with T = 10 s and the start; then once more for the kind, with 5.3 T
+    assert left.seconds() == pytest.approx(90.0 * (53.3 * 41.5 / 21.5 + 30.0) / (53.3 + 10.0), rel=0.001)
     clock[0] = 1e4  # silent for long
     assert left.seconds() > 2e3
     for case in ("Load1", "Load2", "Load3"):
