@@ -50,7 +50,7 @@ _LABEL_S_PER_MVOXEL = 5.0
 _REPORT_S, _ACCURACY_REPORT_S, _MESH_WRITING_S = 1.0, 2.0, 2.0
 # The time that a `Cost` has for a phantom is that at 0.8 mm; a part of it does not depend on the voxels.
 _PHANTOM, _PHANTOM_VOXEL_MM3 = 0.2, 0.512
-_COMPARE_PARTS = {"reading": 0.1, "comparing": 0.5, "writing": 0.4}  # of its time
+_COMPARE_PARTS = {"reading": 0.2, "comparing": 0.47, "writing": 0.33}  # of its time
 # Cells fill the volume (`_SHAPE`: their volume over their edge cubed) and line the surfaces of tissues: heels of 35,000
 # and 79,500 cells (label maps of 1.2 and 0.8 mm, edges of 4 and 2.8 mm) should have 33,000 and 83,000.
 _SHAPE, _CELLS_PER_FACE = 0.1, 0.85

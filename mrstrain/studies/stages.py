@@ -19,7 +19,7 @@ _M = TypeVar("_M", bound=Options)
 Tell = Callable[[str, float], None]
 _PARTS = {
     "aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2),
-    "reading": (0.0, 0.1), "comparing": (0.1, 0.5), "writing": (0.6, 0.4),
+    "reading": (0.0, 0.2), "comparing": (0.2, 0.47), "writing": (0.67, 0.33),
     "meshing": (0.0, 1.0),
 }  # fmt: skip
 # of the time of a registration or a comparison: when each of its parts begins, and how much of it the part takes

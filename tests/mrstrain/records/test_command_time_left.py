@@ -1,9 +1,8 @@
 """The time left of single commands, replayed on recorded runs: within a factor of two from the first tenth on.
 
-Each run was recorded on two cores that ten to fourteen processes shared, by two clocks: that of the processor time of
-the command and all its processes, which stands for idle cores, and that on the wall, where the commands took three to
-six times as long, and not evenly. The last 3 % of a run, or 1.5 s of processor time, are left out: a second is a factor
-of two there. Where the time left is not right all the time, the test says for how much of it.
+Each run was recorded on two cores that ten to twenty processes shared, by two clocks. The processor time of the command
+and its processes stands for idle cores. By the wall clock, commands took three to eight times as long, and unevenly.
+The last 3 % of a run, or 1.5 s of processor time, are left out: a second is a factor of two there.
 """
 
 from __future__ import annotations
@@ -30,6 +29,14 @@ from mrstrain.records.time_left import Expected, Pace, TimeLeft
 RUNS: dict[str, Any] = json.loads(Path(__file__).with_name("command_runs.json").read_text())
 LAST, LAST_S = 0.03, 1.5
 TREBBI = material_set("trebbi")
+# For how much of the time it is right at least: on idle cores, and on busy ones. A mesh is made by native code that
+# tells nothing, so a busy machine is found out by the start of the command alone.
+RIGHT = {
+    "register, 64^3": (0.75, 0.7), "register, 64^3, labels": (0.9, 0.9), "register, 128^3": (0.9, 0.9),
+    "register, 128^3, labels": (0.98, 0.9), "register, four loads, labels": (0.98, 0.75),
+    "simulate, 34,000 cells": (0.98, 0.98), "mesh": (0.9, 0.4), "accuracy, four phantoms": (0.85, 0.75),
+    "compare, two models": (0.95, 0.8),
+}  # fmt: skip
 
 
 def expected(size: dict[str, Any]) -> dict[str, Expected]:
@@ -75,15 +82,14 @@ def right(name: str, clock: list[float], idle: bool) -> float:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_on_idle_cores_the_time_left_is_right_within_a_factor_of_two(name: str, clock: list[float]) -> None:
-    assert right(name, clock, idle=True) >= IDLE.get(name, 1.0)
+@pytest.mark.parametrize("idle", [True, False])
+def test_the_time_left_of_a_command_is_right_within_a_factor_of_two(name: str, idle: bool, clock: list[float]) -> None:
+    assert right(name, clock, idle) >= RIGHT[name][not idle]
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_on_a_busy_machine_it_is_so_for_most_of_the_time(name: str, clock: list[float]) -> None:
-    assert right(name, clock, idle=False) >= BUSY[name]
-
-
-def test_it_would_not_be_so_without_the_pace(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_busy_machine_it_would_not_be_so_without_the_pace(
+    name: str, clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Pace, "of", lambda self, stage: 1.0)
-    assert right("register, 128^3, labels", clock, idle=False) < 0.5
+    assert right(name, clock, idle=False) < 0.3
