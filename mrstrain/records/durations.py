@@ -48,8 +48,8 @@ PASSED = 0.3
 _FIGURES_S = 2.0  # of a material set
 _LABEL_S_PER_MVOXEL = 5.0
 _REPORT_S, _ACCURACY_REPORT_S, _MESH_WRITING_S = 1.0, 2.0, 2.0
-# The time that a `Cost` has for a phantom is that at 0.8 mm; a part of it does not depend on the voxels.
-_PHANTOM, _PHANTOM_VOXEL_MM3 = 0.2, 0.512
+# A `Cost` has the time for a phantom at 0.8 mm, of which so much is for its voxels.
+_OF_VOXELS_S, _PHANTOM_VOXEL_MM3 = 24.0, 0.512
 _COMPARE_PARTS = {"reading": 0.2, "comparing": 0.47, "writing": 0.33}  # of its time
 # Cells fill the volume (`_SHAPE`: their volume over their edge cubed) and line the surfaces of tissues: heels of 35,000
 # and 79,500 cells (label maps of 1.2 and 0.8 mm, edges of 4 and 2.8 mm) should have 33,000 and 83,000.
@@ -103,7 +103,7 @@ def comparison(models: Sequence[int], at_once: int) -> Expected:
 
 def phantom_s(cost: Cost, voxel_mm3: float) -> float:
     """Time to make, register and score a phantom with voxels of this volume."""
-    return float(cost.phantom_seconds) * (_PHANTOM + (1.0 - _PHANTOM) * _PHANTOM_VOXEL_MM3 / voxel_mm3)
+    return float(cost.phantom_seconds - _OF_VOXELS_S * (1.0 - _PHANTOM_VOXEL_MM3 / voxel_mm3))
 
 
 def accuracy_runs(what: str, runs_s: float) -> Expected:
