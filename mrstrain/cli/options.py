@@ -4,6 +4,7 @@ import functools
 import inspect
 import operator
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import UnionType
@@ -74,9 +75,12 @@ class Done(Protocol):
 
 def carry_out(work: Callable[P, Done], *given: P.args, **options: P.kwargs) -> None:
     """Call a function that takes ``progress``, show it live, then `tell` what was done."""
+    import psutil
+
     from mrstrain.records.progress import live
 
-    with live() as progress:
+    age_s = time.time() - psutil.Process().create_time()  # imports, too, take longer on a busy machine
+    with live(began=time.monotonic() - max(age_s, 0.0)) as progress:
         done = work(*given, **options, progress=progress)  # type: ignore[arg-type]
     tell(done)
 

@@ -53,8 +53,8 @@ def expect(progress: OnProgress | None, cases: Mapping[str, Expected], workers: 
 class Live:
     """Progress that is shown: of each case, until `expect` has told what is to come; then of the whole in one line."""
 
-    def __init__(self, show: OnProgress, log: OnProgress) -> None:
-        self._show, self._log, self._began = show, log, time.monotonic()
+    def __init__(self, show: OnProgress, log: OnProgress, began: float) -> None:
+        self._show, self._log, self._began = show, log, began
         self._left: TimeLeft | None = None
         self._parts: dict[str, str] = {}  # of the cases under way
         self._under_way = STARTING
@@ -107,15 +107,16 @@ class Live:
 
 
 @contextmanager
-def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[OnProgress]:
+def live(*, of_all: bool = False, console: Console | None = None, began: float | None = None) -> Iterator[OnProgress]:
     """Show progress on standard error; standard output is for results. An interrupt is reported in a line.
 
     A command that tells what it expects (`expect`) has one bar, or one line now and then, with the time left of all.
     ``of_all`` says that the case "all" is reported besides its parts, as studies do. Its bar is then the first and
     shown from the start, and what a part found is printed when it has ended. Without a terminal there is a line for
-    each part that has ended, and one every minute between.
+    each part that has ended, and one every minute between. ``began`` is when the command began, on the clock of
+    `time.monotonic`; now by default.
     """
-    console = console or Console(stderr=True)
+    console, began = console or Console(stderr=True), time.monotonic() if began is None else began
 
     def shown(others: OnProgress, case: str, stage: str, fraction: float) -> None:
         if case == NOTE:
@@ -124,9 +125,9 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
             others(case, stage, fraction)
 
     try:
-        lines = nullcontext(_lines_of_all() if of_all else _lines())
-        with _bars(console, of_all) if console.is_terminal else lines as to:
-            whole = Live(partial(shown, to), _Logged(of_all))
+        lines = nullcontext(_lines_of_all() if of_all else _lines(began))
+        with _bars(console, of_all, began) if console.is_terminal else lines as to:
+            whole = Live(partial(shown, to), _Logged(of_all), began)
             try:
                 yield whole
                 whole.close()
@@ -185,14 +186,15 @@ class _TimeLeft(ProgressColumn):
 
 
 @contextmanager
-def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
+def _bars(console: Console, of_all: bool, command_began: float) -> Iterator[OnProgress]:
     """Show a bar for each case under way; finished ones are hidden, because lines beyond the terminal are cut off."""
     bars: dict[str, TaskID] = {}
     name, percentage = (TextColumn(text) for text in ("{task.description}", "{task.percentage:>3.0f} %"))
     columns = name, BarColumn(), percentage, TimeElapsedColumn(), _TimeLeft()
     with Progress(*columns, console=console) as display:
         stages: dict[str, str] = {}
-        bars[ALL] = display.add_task(ALL, total=1.0, visible=of_all)  # its clock begins now
+        bars[ALL] = display.add_task(ALL, total=1.0, visible=of_all)
+        display.tasks[0].start_time = command_began
 
         def progress(case: str, stage: str, fraction: float) -> None:
             visible = case == ALL or fraction < 1.0
@@ -211,11 +213,11 @@ def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
         yield progress
 
 
-def _lines() -> OnProgress:
+def _lines(command_began: float) -> OnProgress:
     """Print a line when a stage begins and ends, and every 15 s between; of a whole command when its stages change."""
     began: dict[tuple[str, str], float] = {}
     printed_at: dict[tuple[str, str], float] = {}
-    all_began, of_all = time.monotonic(), ("", -math.inf)  # what was under way, and when that was printed
+    of_all = "", -math.inf  # what was under way, and when that was printed
 
     def progress(case: str, stage: str, fraction: float) -> None:
         nonlocal of_all
@@ -223,7 +225,7 @@ def _lines() -> OnProgress:
         if case == ALL:
             if stage != of_all[0] or now - of_all[1] >= _LINE_EVERY_S:
                 of_all = stage, now
-                time_left, spent = _left(now - all_began, fraction), duration(now - all_began)
+                time_left, spent = _left(now - command_began, fraction), duration(now - command_began)
                 share = f"{100 * fraction:.0f} % after {spent}{', ' * bool(time_left)}{time_left}"
                 line = f"{stage} after {spent}" if fraction >= 1.0 else f"{stage} ({share})"
                 print(line, file=sys.stderr, flush=True)

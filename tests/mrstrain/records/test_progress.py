@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import time
 
 import pytest
 from rich.console import Console
@@ -85,7 +86,7 @@ def test_in_a_terminal_it_has_one_bar() -> None:
 def test_a_whole_that_is_silent_is_told_all_the_same_and_one_that_failed_is_not_called_finished(monkeypatch) -> None:
     monkeypatch.setattr(progress, "_TOLD_EVERY_S", 0.01)
     shown: list[tuple[str, str, float]] = []
-    whole = progress.Live(lambda *one: shown.append(one), lambda *_: None)
+    whole = progress.Live(lambda *one: shown.append(one), lambda *_: None, time.monotonic())
     whole.expect(LOADS, 1)
     whole("Load1", "aligning", 0.0)
     wait_for(lambda: len(shown) > 5)
