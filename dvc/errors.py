@@ -5,6 +5,9 @@ of 100 characters (`tests/test_messages.py`), so a list of any length is shorten
 """
 
 import collections.abc
+import logging
+
+_log = logging.getLogger(__name__)
 
 
 class MrstrainError(Exception):
@@ -51,4 +54,6 @@ def few(items: collections.abc.Iterable[object], most: int = 6) -> str:
     """
     listed = [str(item) for item in items]
     more = len(listed) - most
+    if more > 0:
+        _log.info("In full: %s", ", ".join(listed))
     return ", ".join(listed[:most]) + (f" and {more} more" if more > 0 else "")

@@ -93,7 +93,9 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point: errors made on purpose are printed as sentences, with exit status 2."""
-    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    shown = logging.StreamHandler()
+    shown.setLevel(logging.WARNING)  # all else is for the log of a command
+    logging.basicConfig(format="%(message)s", level=logging.WARNING, handlers=[shown])
     _share_arenas()
     # What removes the semaphores of processes that an interrupt ended need not tell of them.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
@@ -115,7 +117,7 @@ def main() -> None:
             message = "The memory ran out. Free memory or use fewer --workers."
         if not message:
             raise
-        _stop(message)
+        _stop("\n".join([message, *getattr(error, "__notes__", ())]))  # such as where the log is
     except SystemExit as ended:
         if ended.code in _TOLD_TO_END:  # threads that still compute would be waited for
             atexit._run_exitfuncs()

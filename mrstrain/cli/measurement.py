@@ -35,7 +35,12 @@ def label(
     load0: Load0,
     *,
     out: Annotated[
-        Path | None, typer.Option(help="Label map to write: .nii.gz, .nii, .nrrd or .mha.", rich_help_panel="Output")
+        Path | None,
+        typer.Option(
+            help="Label map to write: .nii.gz, .nii, .nrrd or .mha. Other files of the same name, among them a .log, "
+            "are also written.",
+            rich_help_panel="Output",
+        ),
     ] = None,
     draw: Annotated[
         Path | None,

@@ -1,6 +1,5 @@
 """The commands of the finite-element side. They parse, call one function, and print."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -33,7 +32,8 @@ def mesh(
     out: Annotated[
         Path,
         typer.Option(
-            help="File name of the mesh, ending in .vtu; a .json, a .png and a .pdf of the same name are also written.",
+            help="File name of the mesh, ending in .vtu; a .json, a .png, a .pdf and a .log of the same name are also "
+            "written.",
             rich_help_panel="Output",
         ),
     ],
@@ -44,12 +44,7 @@ def mesh(
 
     The surface sets are bone, skin, and cut (the truncation surface).
     """
-    from mrstrain.records.progress import live
-
-    with live() as progress:
-        watch = partial(progress, "mesh", "meshing")
-        done = mrstrain.mesh.with_options(labels, out=out, labelling=labelling, meshing=meshing, watch=watch)
-    tell(done)
+    carry_out(mrstrain.mesh.with_options, labels, out=out, labelling=labelling, meshing=meshing)
 
 
 @takes_options

@@ -4,6 +4,7 @@ import functools
 import inspect
 import operator
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import UnionType
@@ -19,7 +20,9 @@ from mrstrain.options.measurement import Frame
 from mrstrain.options.model import Options, bare
 
 P = ParamSpec("P")
-Out = Annotated[Path, typer.Option(help="Folder for the results; created if missing.", rich_help_panel="Output")]
+Out = Annotated[
+    Path, typer.Option(help="Folder for the results and log.txt; created if missing.", rich_help_panel="Output")
+]
 FieldFrame = Annotated[
     Frame | None,
     typer.Option(
@@ -57,6 +60,9 @@ EXAMPLES = {
 }
 """The end of a command's help, by command. Files have the names that `mrstrain phantom` gives them."""
 
+_TYPED = "mrstrain.typed"  # where a context of click keeps the command line
+_HAS_STUDY_LOG = "demo"
+_ONE_FILE = ("label", "mesh")  # commands that write a file, and others beside it
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
 
 
@@ -69,9 +75,12 @@ class Done(Protocol):
 
 def carry_out(work: Callable[P, Done], *given: P.args, **options: P.kwargs) -> None:
     """Call a function that takes ``progress``, show it live, then `tell` what was done."""
+    import psutil
+
     from mrstrain.records.progress import live
 
-    with live() as progress:
+    age_s = time.time() - psutil.Process().create_time()  # imports, too, take longer on a busy machine
+    with live(began=time.monotonic() - max(age_s, 0.0)) as progress:
         done = work(*given, **options, progress=progress)  # type: ignore[arg-type]
     tell(done)
 
@@ -85,10 +94,26 @@ def tell(done: Done) -> None:
 
 
 class Grouped(TyperCommand):
-    """A command whose help lists its options in groups, and which says what a missing argument is."""
+    """A command whose help lists its options in groups, which says what a missing argument is, and has a log."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Call the command, with a log beside the results that it writes; where it is, follows what is not complete."""
+        out = ctx.params.get("out")
+        if out is None or ctx.info_name == _HAS_STUDY_LOG:
+            return super().invoke(ctx)
+        from mrstrain.records.log import logged
+
+        with logged(Path(out), ["mrstrain", *ctx.meta[_TYPED]], one_file=ctx.info_name in _ONE_FILE) as log:
+            try:
+                return super().invoke(ctx)
+            except typer.Exit as ended:
+                status = ended.exit_code
+        say(f"Log: {log.place}")
+        raise typer.Exit(status)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; an error on a missing argument or option includes its help."""
+        ctx.meta[_TYPED] = [ctx.info_name, *args]
         try:
             return super().parse_args(ctx, args)
         except Exception as missing:

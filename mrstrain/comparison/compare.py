@@ -30,8 +30,9 @@ from mrstrain.options.door import door
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
 from mrstrain.records.doctor import usable_memory_bytes
+from mrstrain.records.durations import comparison as comparison_of
 from mrstrain.records.inputs import alone, output_folder, refuse_touching_inputs
-from mrstrain.records.progress import NOTE, OnProgress
+from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.provenance import provenance
 
 _BYTES_OF_A_LOAD = 1 << 30  # approximate memory of the process that compares one load
@@ -140,9 +141,11 @@ def compare(
         "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
     }  # fmt: skip
     folders, of_models = {load: m.folder for load, m in compared.items()}, {file.name: file.path for file in results}
+    at_once = _at_once(len(compared))
+    expect(progress, {"compare": comparison_of([len(of) for of in files.values()], at_once)})
     with (
         tempfile.TemporaryDirectory(prefix="mrstrain-") as kept,
-        side_by_side("comparing", _at_once(len(compared))) as each,
+        side_by_side("comparing", at_once) as each,
     ):
         cases = [
             _case(m, files[load], tissues.grid, own.get(load, axes), Path(kept) / load) for load, m in compared.items()

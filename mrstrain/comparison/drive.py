@@ -1,5 +1,6 @@
 """`drive`: constitutive models under measured (Dirichlet) boundary conditions, without plate, contact and friction."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,6 +21,7 @@ from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
+_log = logging.getLogger(__name__)
 ENDING = "-driven"  # of a set's folder
 _BOUNDARY = "boundary"  # folder in it, of the boundary conditions for other codes
 
@@ -111,6 +113,7 @@ def _drive_set(
             raise
         except MrstrainError as failure:
             lines.append(f"{name}: {failure}")
+            _log.info("%s, %s failed", name, load, exc_info=failure)
             continue
         fe.write_state(folder / f"{load}.vtu", mesh, state, laws)
         outcome[load] = {"reached": state.reached, "iterations": state.iterations, "seconds": round(state.seconds, 1)}

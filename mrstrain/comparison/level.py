@@ -1,5 +1,6 @@
 """`level`: forward-model comparison (levelling), the measurement simulated on the displacement of a model."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,14 +20,16 @@ from mrstrain.measurement.register import register
 from mrstrain.options import measurement as options
 from mrstrain.options.door import door
 from mrstrain.options.modelling import ModelReading
+from mrstrain.records.durations import registrations
 from mrstrain.records.inputs import alone, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.measured_with import MeasuredWith
 from mrstrain.records.outcome import Outcome
-from mrstrain.records.progress import NOTE, OnProgress
+from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
 
+_log = logging.getLogger(__name__)
 _CHANGED_MM, _FEW = 0.1, 0.01
 
 
@@ -79,7 +82,8 @@ def level(
     # Incompressibility is always enforced: the displacement extrapolated outside the model's mesh is not isochoric.
     volume = volume_kept(engine)
     how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
-    engine_of(how, labelled=subject_files.labels is not None)  # refused now rather than after the images are made
+    # refused now rather than after the images are made
+    cost = engine_of(how, labelled=subject_files.labels is not None).cost
     subject = read_subject(load0, subject_files)
     of_load, notes = model_files(list(loads) or loads_of(place, reading.model_mesh is not None), [place], reading)
     files = {load: file for load, (file,) in of_load.items()}
@@ -97,6 +101,7 @@ def level(
         for load in results:
             held_loads.enter_context(alone(target / name / f"{load}.vtu", work / f".{load}.lock"))
         _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
+        expect(progress, registrations(results, cost, float(np.prod(subject.reference.grid.shape))))
         for load, result in results.items():
             registered = work / "registered" / load  # of its own, since a study runs several loads at the same time
             try:
@@ -107,6 +112,7 @@ def level(
                 )  # fmt: skip
             except (RegistrationError, WorkerError) as failed:
                 failures.append(f"{load} could not be registered: {failed}")
+                _log.info("%s failed", load, exc_info=failed)
             else:
                 _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):

@@ -1,5 +1,6 @@
 """How the loads of a subject are measured, in a series or by a worker of a study, and checked by their twins."""
 
+import logging
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -28,6 +29,7 @@ _Files = Mapping[str, Path | list[Path]]
 _SETTINGS = {*EngineOptions.model_fields, "align", "bending", "volume", "allow_unknown_parameters", "error_model"}
 """Options of a registration that its record has as settings, or by the file's hash."""
 _FOLDED = 1e-3
+_log = logging.getLogger(__name__)
 
 
 Registered = tuple[Registration, TwinCheck | None]
@@ -117,6 +119,7 @@ def _twin_check(
             start=start, worker=worker, progress=lambda stage, fraction: tell(f"synthetic warp: {stage}", fraction),
         )  # fmt: skip
     except MrstrainError as reason:
+        _log.info("The synthetic warp failed", exc_info=reason)
         return TwinCheck(None, str(reason))
     maps = maps_of(again)
     folded = float(np.mean(maps.jacobian[tissue.inside] <= 0.0))

@@ -1,5 +1,6 @@
 """`register`: images in, a folder of strain maps and a report out; `register_one` is the part of it in a study."""
 
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -37,6 +38,7 @@ from mrstrain.options.measurement import (
     SubjectFiles,
 )
 from mrstrain.options.model import Flag
+from mrstrain.records.durations import LABELS, REPORT, WRITING, registrations
 from mrstrain.records.inputs import (
     alone,
     case_names,
@@ -47,8 +49,10 @@ from mrstrain.records.inputs import (
     refuse_touching_inputs,
 )
 from mrstrain.records.outcome import with_reasons
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import OnProgress, expect
+from mrstrain.records.time_left import FAILED
 
+_log = logging.getLogger(__name__)
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
 _BYTES_PER_VOXEL = 35  # of one image's results: 27 as measured, 5 with the plate's axes
 
@@ -109,12 +113,16 @@ def register(
         first = worker or stack.enter_context(Worker(threads))
         first.start(align_images.__module__, type(chosen).__module__)
         images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
+        to_label = subject_files.labels == AUTO
+        seen = float(np.prod(images[cases[0]].grid.shape))  # about as many voxels as the unloaded image has
+        how_long = registrations(cases, chosen.cost, seen, twin=registration.twin, label_first=to_label)
+        expect(progress, how_long, at_once)
         # Read now: what is wrong with it must not be found after an hour.
         model = None if registration.error_model is None else read_error_model(registration.error_model)
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
-        if subject_files.labels == AUTO:
+        if to_label:
             _hold(target, stack)
-            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
+            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, LABELS, "tissues"))
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         subject = replace(subject, tissue=subject.body())
         # Its rigid motion is found by aligning.
@@ -140,9 +148,12 @@ def register(
             _hold(target, stack)
         run.all(at_once, registration.chain, first)
         finished = run.finished()
+    tell(REPORT, WRITING, 0.0)
     shown = [case for case in finished if case.name != REPEAT]
     answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
-    return Series.of(target, finished, run.failures, record, answer, of_labels)
+    series = Series.of(target, finished, run.failures, record, answer, of_labels)
+    tell(REPORT, WRITING, 1.0)
+    return series
 
 
 def _hold(out: Path, stack: ExitStack) -> None:
@@ -255,7 +266,7 @@ class _Run:
     ) -> None:
         self.out, self.plan, self.images, self.start, self._tell = out, plan, images, start, tell
         self.cases: dict[str, Case] = {}
-        self.failures: dict[str, str] = {}
+        self.errors: dict[str, MrstrainError] = {}
         self._floor: NoiseFloor | None = None
         self._telling, self._writing = threading.Lock(), threading.Lock()
         self._floor_known = threading.Event()
@@ -285,7 +296,9 @@ class _Run:
                     self._floor = floor if is_repeat else self._floor
                     told("strain and figures", 1.0)
             except MrstrainError as error:
-                self.failures[name] = str(error)
+                self.errors[name] = error
+                _log.info("%s failed", name, exc_info=error)
+                told(FAILED, 1.0)
             finally:
                 if is_repeat:
                     self._floor_known.set()
@@ -296,8 +309,14 @@ class _Run:
         """The loads that were registered, in the order given; RegistrationError where none was."""
         if not self.cases:
             reasons = [f"{name}: {reason}" for name, reason in self.failures.items()]
-            raise RegistrationError(with_reasons("No load could be registered.", reasons))
+            gravest = min(self.errors.values(), key=lambda error: isinstance(error, InputError))
+            raise RegistrationError(with_reasons("No load could be registered.", reasons)) from gravest
         return tuple(self.cases[name] for name in self.images if name in self.cases)
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why loads could not be registered."""
+        return {name: str(error) for name, error in self.errors.items()}
 
     def _told(self, case: str, stage: str, fraction: float) -> None:
         with self._telling:

@@ -1,7 +1,7 @@
 """`converge`: mesh convergence, the same loads on meshes of several sizes, and the extrapolated limits."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +13,30 @@ from dvc.errors import InputError, MrstrainError, few
 from dvc.measurement.subject import bones_of
 from dvc.own_files import read_json
 from dvc.report.drawing import figure_files, save_figure
-from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
+from dvc.threads import usable_cores
+from fe import (
+    Limit,
+    LoadStep,
+    MaterialSet,
+    Simulation,
+    cell_size_mm,
+    extrapolate,
+    figures,
+    material_set,
+    paths_of,
+    read_tet_mesh,
+)
 from mrstrain.models.mesh import mesh as make_mesh
-from mrstrain.models.simulate import LOADS, simulate
+from mrstrain.models.simulate import LOADS, path_name, simulate
 from mrstrain.models.variant_files import MESH, VARIANT, VariantRecord
 from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
+from mrstrain.records.durations import PathSize, cells_of, meshing, simulations
 from mrstrain.records.inputs import alone, output_folder, refuse_touching_inputs
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import file_hash, provenance
+from mrstrain.records.time_left import Expected
 
 _FEWEST = 3
 _SHEAR = "maximum shear strain"
@@ -101,14 +115,18 @@ def converge(
     if region not in known or region in bones:
         raise InputError(f"The label map has no soft tissue '{region}'; it has {few(known)}.")
     # an unsuitable material set is refused before hours of meshing
-    material_set(material).for_regions([name for name in known if name not in bones])
+    chosen = material_set(material)
+    chosen.for_regions([name for name in known if name not in bones])
     with output_folder(target), alone(target):
         places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
+        to_mesh = [edge for edge, place in places.items() if not _is_of(place, inputs, bones)]
+        cells = {edge: cells_of(tissues, bones, edge) for edge in edges}
+        expect(progress, _expected(cells, to_mesh, chosen, loads), workers or usable_cores())
         for edge, place in places.items():
-            if not _is_of(place, inputs, bones):
+            if edge in to_mesh:
                 make_mesh.with_options(
                     labels, out=place, labelling=labelling, meshing=options.Meshing(edge_mm=edge),
-                    watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
+                    progress=lambda _, stage, share, edge=edge: tell(f"{edge:g} mm", stage, share),  # type: ignore[misc]
                 )  # fmt: skip
         sizes = np.array([cell_size_mm(read_tet_mesh(place)) for place in places.values()])
         extrapolate(sizes, sizes)  # refuses sizes that give no limit, before anything is simulated
@@ -144,6 +162,23 @@ def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], floa
         if row.region == region
         for percent, value in ((50, row.shear_p50), (90, row.shear_p90), (99, row.shear_p99))
     }
+
+
+def _expected(
+    cells: Mapping[float, float], to_mesh: Sequence[float], one: MaterialSet, loads: Sequence[LoadStep]
+) -> dict[str, Expected]:
+    """Meshes and simulations, one after another, by their names; ``cells`` of the mesh of each edge length."""
+    expected: dict[str, Expected] = {}
+    before: tuple[str, ...] = ()
+    for edge in to_mesh:
+        expected[f"{edge:g} mm"] = replace(meshing(cells[edge]), before=before)
+        before = (f"{edge:g} mm",)
+    paths = {path_name(one, path): PathSize(one, len(path), 0) for path in paths_of(loads)}
+    for edge, count in cells.items():
+        solved = simulations({f"{edge:g} mm, {name}": path for name, path in paths.items()}, count, "P1")
+        expected |= {name: replace(path, before=before) for name, path in solved.items()}
+        before = tuple(solved)
+    return expected
 
 
 def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> bool:

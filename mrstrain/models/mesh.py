@@ -1,7 +1,7 @@
 """`mesh`: tetrahedral mesh of the soft tissues of a label map, with its quality and a figure."""
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,13 @@ from dvc.report.drawing import ENDINGS, save_figure
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
 from mrstrain.options.modelling import Labelling, Meshing
+from mrstrain.records.durations import MESHING, WRITING, cells_of, meshing as expected_of
 from mrstrain.records.inputs import alone, output_folder
+from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import provenance
 
 _CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0
+_CASE = "mesh"  # of progress
 _INFERIOR, _FORWARD = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
 
 
@@ -66,8 +69,7 @@ class Meshed:
 
 @door
 def mesh(
-    labels: Path | str, *, out: Path | str, labelling: Labelling, meshing: Meshing,
-    watch: Callable[[float], None] | None = None,
+    labels: Path | str, *, out: Path | str, labelling: Labelling, meshing: Meshing, progress: OnProgress | None = None,
 ) -> Meshed:  # fmt: skip
     """Mesh the soft tissues of a label map.
 
@@ -77,8 +79,10 @@ def mesh(
         As in `register`.
     out : path
         The mesh, ending in .vtu; next to it are written a .json with names and quality, and a slice as .png and .pdf.
-    labelling, meshing, watch
+    labelling, meshing
         As in `fe.mesh_labels`.
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
 
     Raises
     ------
@@ -96,17 +100,21 @@ def mesh(
     with output_folder(target.parent), alone(target, target.with_name(f".{target.name}.lock")):
         how = meshing.model_dump()
         bones = bones_of(given, labelling.bones)
-        made, quality = mesh_labels(given, **how, bones=bones, watch=watch or (lambda _: None))
+        tell = progress or (lambda *_: None)
+        expect(progress, {_CASE: expected_of(cells_of(given, bones, meshing.edge_mm))})
+        made, quality = mesh_labels(given, **how, bones=bones, watch=partial(tell, _CASE, MESHING))
+        tell(_CASE, WRITING, 0.0)
         del how["limit_s"]  # does not affect the mesh
         record = provenance("mesh", files, how | {"bones": list(bones)})
         write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     save_figure(target.with_suffix(""), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
+    tell(_CASE, WRITING, 1.0)
     return Meshed(target, made, quality)
 
 
 def mesh_coarser(
     labels: Path, *, out: Path, ratio: float, labelling: Labelling, meshing: Meshing,
-    watch: Callable[[float], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> Meshed:  # fmt: skip
     """Mesh a label map with edges that are longer by a ratio, and voxels larger by it unless a tissue would be lost.
 
@@ -121,9 +129,9 @@ def mesh_coarser(
     write_labels(place, _coarser(read_labels(labels, labelling.names), ratio))
     beside = labelling.model_copy(update={"names": place.with_name("labels.csv")})
     try:
-        return mesh.with_options(place, out=out, labelling=beside, meshing=longer, watch=watch)
+        return mesh.with_options(place, out=out, labelling=beside, meshing=longer, progress=progress)
     except MrstrainError:  # a tissue is too thin for these voxels
-        return mesh.with_options(labels, out=out, labelling=labelling, meshing=longer, watch=watch)
+        return mesh.with_options(labels, out=out, labelling=labelling, meshing=longer, progress=progress)
 
 
 def _coarser(labels: LabelMap, ratio: float) -> LabelMap:

@@ -1,5 +1,6 @@
 """`simulate`: a mesh under the loads of a plate, for one or more material sets."""
 
+import logging
 import re
 import tempfile
 import threading
@@ -23,16 +24,19 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores, in_parallel
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
+from mrstrain.records.durations import PASSED, SIMULATING, WRITING, PathSize, figures_of, simulations
 from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
-from mrstrain.records.progress import NOTE, OnProgress
+from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.provenance import provenance
+from mrstrain.records.time_left import STARTING
 
 LOADS = (
     fe.LoadStep("Load1", 140.0), fe.LoadStep("Load2", 15.0),
     fe.LoadStep("Load3", 15.0, 45.0), fe.LoadStep("Load4", 15.0, 12.0),
 )  # fmt: skip
 """Loads of the published experiment."""
+_log = logging.getLogger(__name__)
 _EVERY_S = 30.0  # smallest time between two checkpoints within a load
 
 
@@ -116,6 +120,8 @@ def simulate(
     at_once = max(1, min(in_parallel(cores.workers), len(jobs)))
     each = cores.threads or max(1, usable_cores() // at_once)
     options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
+    sizes = {path_name(one, path.loads): PathSize(one, len(path.loads), len(path.passed)) for one, path in jobs}
+    expect(progress, simulations(sizes, len(read.cells), simulation.element, limit_s), at_once)
     run = _Run(target, loads, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
     with ExitStack() as held_folders:
         for folder in (target / one.name for one in chosen):
@@ -129,6 +135,18 @@ def simulate(
         kind = WorkerError if run.died == run.failures.keys() else MrstrainError
         raise kind(with_reasons("Every simulation failed.", [f"{n}: {r}" for n, r in run.failures.items()]))
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
+
+
+def path_name(one: fe.MaterialSet, loads: Sequence[fe.LoadStep]) -> str:
+    """The name of a load path with a material set."""
+    return f"{one.name}, {' '.join(step.name for step in loads)}"
+
+
+def _share(problem: fe.Problem, loads_done: float) -> float:
+    """How much of the time of a path has passed where a fraction of all its loads is done, passed ones included."""
+    own, passed = len(problem.loads), len(problem.passed)
+    done = loads_done * (own + passed)
+    return (PASSED * min(done, passed) + max(done - passed, 0.0)) / (own + PASSED * passed)
 
 
 def _remove_earlier(folder: Path, loads: Collection[str]) -> None:
@@ -195,28 +213,32 @@ class _Run:
 
     def path(self, chosen: fe.MaterialSet, problem: fe.Problem, options: fe.SolverOptions, worker: Worker) -> None:
         """Solve one path."""
-        case = f"{chosen.name}, {' '.join(step.name for step in problem.loads)}"
+        case = path_name(chosen, problem.loads)
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
             share, place, what = Path(folder) / "share", self.target / chosen.name, f"simulating {case}"
 
             def watch() -> None:
                 if share.exists():
-                    self.progress(case, "simulating", float(share.read_text() or 0.0))
+                    self.progress(case, SIMULATING, _share(problem, float(share.read_text() or 0.0)))
 
             states: list[fe.LoadState] = []
             try:
                 if not self._passed_in_vain(chosen, problem):
+                    self.progress(case, STARTING, 0.0)
                     states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
             except MrstrainError as failure:
                 self.failures[case] = str(failure)
+                _log.info("%s failed", case, exc_info=failure)
                 self.crashed.add(id(problem))
                 self.died.update({case} if isinstance(failure, WorkerError) else ())
         with self.writing:
             self.ended[id(problem)] = states
             problems = [one for other, one in self.jobs if other is chosen]
+            self.progress(case, SIMULATING, 1.0)
             if all(id(one) in self.ended for one in problems):
+                self.progress(figures_of(chosen.name), WRITING, 0.0)
                 self._write(chosen, problems)
-        self.progress(case, "simulating", 1.0)
+                self.progress(figures_of(chosen.name), WRITING, 1.0)
 
     def _passed_in_vain(self, chosen: fe.MaterialSet, problem: fe.Problem) -> bool:
         """Whether another path has ended without equilibrium under a load that this one passes."""

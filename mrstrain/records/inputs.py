@@ -20,6 +20,7 @@ from dvc.measurement.subject import LabelsFromImage, plate_directions
 from dvc.mesh import box_told
 from dvc.own_files import read_json
 from mrstrain.options.measurement import AUTO, MADE_LABELS, MeshAndAxes, SubjectFiles
+from mrstrain.records.log import begin_logs
 from mrstrain.records.provenance import file_hash
 
 _LOCK = ".mrstrain-lock"
@@ -188,7 +189,7 @@ def output_folder(out: Path) -> Iterator[None]:
 
 
 def make_output(out: Path) -> None:
-    """Make the output folder, and refuse one that cannot be written to."""
+    """Make the output folder, in which the log of a command then begins, and refuse one that cannot be written to."""
     if not is_utf8(out):  # native code that writes into it would end the process
         name = str(out).encode(errors="backslashreplace").decode()
         raise OutputError(f"{name}: the name of the output folder is not UTF-8. Choose another folder (out).")
@@ -204,3 +205,4 @@ def make_output(out: Path) -> None:
             f"{out}: results cannot be written here ({error.strerror or error}). Choose another folder (out), "
             "change its permissions, or free disk space."
         ) from error
+    begin_logs()

@@ -111,3 +111,14 @@ def without_folders(value: Any, home: Path) -> Any:
     if not place.is_relative_to(home):
         return "a folder" if place.is_dir() else place.name
     return place.relative_to(home).as_posix() if os.path.isabs(value) else str(value)
+
+
+def without_places(text: str, places: Mapping[Path, tuple[str, str]]) -> str:
+    """A text without the locations of folders: what stands for one before a file within it, and for one alone."""
+    for place in sorted(places, key=lambda one: -len(str(one))):  # inner folders first
+        if place != place.parent:
+            within, alone = places[place]
+            begin = rf"(?<![\w.-]){re.escape(str(place))}"
+            text = re.sub(begin + re.escape(os.sep), within.replace("\\", r"\\"), text)
+            text = re.sub(rf"{begin}(?![\w.-])", alone, text)
+    return text

@@ -6,44 +6,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from dvc import TetMesh, read_image, read_labels
-from dvc.arrays import BoolArray, IntArray
 from dvc.errors import InputError
 from dvc.measurement.subject import bones_of
 from dvc.registration.engine import Cost
 from dvc.threads import usable_cores
-from fe import LoadStep, MaterialSet, material_set, paths_of, read_tet_mesh
+from fe import LoadStep, material_set, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
+from mrstrain.records.durations import cells_of, comparison_s, label_s, load_s, mesh_s, registration_s
 from mrstrain.records.progress import duration
+from mrstrain.records.time_left import Expected, TimeLeft
 from mrstrain.studies.file import Study
 from mrstrain.studies.plan import COARSE, Stage, drawn_to_mesh, mesh_place
-from mrstrain.studies.time_left import Expected, TimeLeft
 
-# Seconds on one core, from 13 recorded demonstrations on two idle cores (2.3 million voxels; 35,000 or 80,000 cells,
-# four loads), and from registrations of 0.3 to 17 million voxels (benchmarks/results/register_scaling.json).
-_REGISTER_S, _MAPS_S_PER_MVOXEL = 8.0, 1.5  # in addition to the engine (`Cost`)
-_TWIN = 1.3  # additional time, relative: the synthetic warp is made and registered
+# Seconds on one core, as those of `mrstrain.records.durations`.
 _SIMULATE_S = 8.0  # of a simulation beside its loads: start, mesh, figures
-_CELLS, _LOAD_S, _GROWTH = 80e3, 12.0, 1.5  # a load of the set trebbi
-# Of trebbi's time. From mesh to mesh luboz took 2.0 to 3.9, spears 2.4 to 7.0; friedman was stopped after 50.
-_SET_TIMES = {
-    "spears": 3.2,
-    "luboz": 2.5,
-    "trebbi": 1.0,
-    "zwam": 0.85,
-    "erdemir": 0.85,
-    "akrami": 0.55,
-    "friedman": 50.0,
-}
-_SOFT_MPA, _SOFTER = 0.03, 0.4  # of other sets, by their softest tissue: for published ones .6 to 1.6 of the above
-# Of P1's time and memory: P2 20 times as long on 60,000 cells of the heel, MINI a third of P2's time on 56,000, where
-# P2 took 2.2 GiB, MINI .84.
-_ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
-_ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
-_MESH_S, _MESH_S_PER_CELL, _LABEL_S_PER_MVOXEL = 4.0, 0.54e-3, 5.0
 _COARSER, _SHORT = 0.35, 0.2  # of the time of a solution: on the coarser mesh, and from the state of another solution
 _COARSER_MESH = 0.5  # of the time of the mesh
-_COMPARE_S, _MODEL_S = 1.0, 5.1  # each load: of it, and of each of its models
+# Of P1's memory, on 56,000 cells, where P2 took 2.2 GiB and MINI .84.
+_ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
 # with strain discontinuities 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells
 # .84.
@@ -51,9 +32,6 @@ _REGISTER_GIB = 0.65
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _COMPARE_GIB, _OTHER_GIB = 1.0, 1.5  # a comparison: of it, and of each of its processes
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
-# Cells fill the volume (`_SHAPE`: their volume over their edge cubed) and line the surfaces of tissues: heels of 35,000
-# and 79,500 cells (label maps of 1.2 and 0.8 mm, edges of 4 and 2.8 mm) should have 33,000 and 83,000.
-_SHAPE, _CELLS_PER_FACE = 0.1, 0.85
 _USUAL_VOXELS, _USUAL_CELLS = 2e6, 60e3
 _GIB = 1024.0**3
 
@@ -77,52 +55,32 @@ def sizes_of(study: Study) -> tuple[float, float]:
         labels = read_labels(*drawn)
     except (InputError, OSError):
         return _USUAL_VOXELS, _USUAL_CELLS
-    bones = bones_of(labels, how.bones)
-    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in bones and n != 0])
-    volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
-    return voxels, volume / (_SHAPE * how.edge_mm**3) + _CELLS_PER_FACE * _faces(labels.labels, soft)
-
-
-def _faces(labels: IntArray, soft: BoolArray) -> int:
-    """Number of the faces of voxels between two labels of which one at least is a soft tissue."""
-    count = 0
-    for axis in range(3):
-        across, inside = np.moveaxis(labels, axis, 0), np.moveaxis(soft, axis, 0)
-        count += int(np.count_nonzero((across[1:] != across[:-1]) & (inside[1:] | inside[:-1])))
-    return count
+    return voxels, cells_of(labels, bones_of(labels, how.bones), how.edge_mm)
 
 
 def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
     """Approximate time of a stage on one core, s; ``voxels`` of the unloaded image, ``cells`` of the mesh."""
     loads = len(study.loads)
     if stage.kind in ("register", "level"):
-        cost = _cost(study)
-        registering = _REGISTER_S + cost.seconds + (cost.seconds_per_mvoxel + _MAPS_S_PER_MVOXEL) * voxels / 1e6
-        return registering * (1.5 if stage.kind == "level" else 1.0 + _TWIN * bool(stage.arguments.get("twin")))
+        parts = registration_s(_cost(study), voxels, twin=bool(stage.arguments.get("twin")))
+        return sum(parts.values()) * (1.5 if stage.kind == "level" else 1.0)
     if stage.kind == "mesh":
-        return (_MESH_S + _MESH_S_PER_CELL * cells) * (_COARSER_MESH if stage.name == COARSE else 1.0)
+        return mesh_s(cells) * (_COARSER_MESH if stage.name == COARSE else 1.0)
     if stage.kind == "label":
-        return _LABEL_S_PER_MVOXEL * voxels / 1e6
+        return label_s(voxels)
     if stage.kind == "compare":
         models = len(set(stage.some.get("models", {}).values()))
-        return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
-    seconds = float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
+        return sum(comparison_s([models + len(study.models.results)] * loads).values())
+    if stage.kind not in ("simulate", "vary"):
+        return loads * load_s(cells)
+    (one,) = stage.arguments["sets"]
+    seconds = loads * load_s(cells, study.models.element, material_set(one))
     if stage.kind == "vary":
         whole, short = study.uncertainty.solutions
         seconds *= (whole + _SHORT * short) * (_COARSER if stage.arguments["coarse"] else 1.0)
-    elif stage.kind != "simulate":
-        return seconds
-    (one,) = stage.arguments["sets"]
-    seconds *= _ELEMENT_TIMES[study.models.element] * _set_time(material_set(one))
     paths = paths_of([LoadStep(**load) for load in stage.arguments["loads"]], stage.arguments["towards"])
     limit = stage.arguments["limit_s"]
     return _SIMULATE_S + (seconds if limit is None else min(seconds, len(paths) * limit))
-
-
-def _set_time(one: MaterialSet) -> float:
-    """Time of a solution over that of the material set trebbi."""
-    softest_mpa = min(material.shear_modulus_mpa for material in one.materials.values())
-    return _SET_TIMES.get(one.name, float((_SOFT_MPA / softest_mpa) ** _SOFTER))
 
 
 def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:

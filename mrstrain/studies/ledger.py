@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.software import software_key
 from dvc.threads import usable_cores
-from mrstrain.records.provenance import file_hash, without_folders
+from mrstrain.records.provenance import file_hash, without_folders, without_places
 from mrstrain.studies.plan import Stage
 from mrstrain.studies.stages import StageResult
 
@@ -66,13 +65,7 @@ class Ledger:
         outside = [place for place in folders if not Path(os.path.normpath(place)).is_relative_to(self.home)]
         shortened = {place: ("", "a folder") for place in outside}
         shortened |= {Path.home(): (f"~{os.sep}", "~"), self.home: ("", ".")}
-        for place in sorted(shortened, key=lambda one: -len(str(one))):  # inner folders first
-            if place != place.parent:
-                within, alone = shortened[place]
-                begin = rf"(?<![\w.-]){re.escape(str(place))}"
-                text = re.sub(begin + re.escape(os.sep), within.replace("\\", r"\\"), text)
-                text = re.sub(rf"{begin}(?![\w.-])", alone, text)
-        return text
+        return without_places(text, shortened)
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
         """Hashes of the input files of a stage, and its arguments without folders, so that a study can be moved."""

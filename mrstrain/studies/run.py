@@ -3,9 +3,8 @@
 import logging
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +14,9 @@ from dvc.io.result_folder import REPORT
 from dvc.memory import hand_memory_back
 from mrstrain.options.measurement import in_parallel
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
+from mrstrain.records.log import append, timed
 from mrstrain.records.progress import ALL, OnProgress
+from mrstrain.records.time_left import Expected, TimeLeft, seconds_to_end
 from mrstrain.studies.check import wrong_with
 from mrstrain.studies.costs import costs, disk_bytes, expected, gib_of, sizes_of
 from mrstrain.studies.file import Study, read_study
@@ -23,7 +24,6 @@ from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
 from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, left_out_of, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
-from mrstrain.studies.time_left import Expected, TimeLeft, seconds_to_end
 from mrstrain.studies.watch import Follower, OnReport, Report, Watch
 
 LOG = "study.log"
@@ -256,6 +256,4 @@ def _alone(out: Path) -> Iterator[None]:
 
 
 def _log(path: Path, text: str) -> None:
-    """Append a line with the current time to a file; a line that a full disk does not take does not stop the run."""
-    with suppress(OSError), path.open("a", encoding="utf-8") as file:
-        file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S}Z {text}\n")
+    append(path, timed(text))

@@ -12,13 +12,15 @@ from typing import Any, TypeVar
 from dvc import Verdict
 from dvc.report.page import Section
 from mrstrain.options.model import Options
+from mrstrain.records.durations import WRITING
 from mrstrain.records.progress import NOTE
 
 _M = TypeVar("_M", bound=Options)
 Tell = Callable[[str, float], None]
 _PARTS = {
     "aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2),
-    "reading": (0.0, 0.1), "comparing": (0.1, 0.5), "writing": (0.6, 0.4),
+    "reading": (0.0, 0.2), "comparing": (0.2, 0.47), "writing": (0.67, 0.33),
+    "meshing": (0.0, 1.0),
 }  # fmt: skip
 # of the time of a registration or a comparison: when each of its parts begins, and how much of it the part takes
 _LEFT_OUT = (
@@ -80,14 +82,16 @@ def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any
     from mrstrain.models.mesh import mesh as run, mesh_coarser
     from mrstrain.options.modelling import Labelling, Meshing
 
-    def watch(share: float) -> None:
-        tell("meshing", share)
+    whole = _whole(tell)
+
+    def told(_: str, part: str, fraction: float) -> None:
+        whole(part, fraction)
 
     if ratio is None:
-        lines = run(labels, watch=watch, **options).summary()
+        lines = run(labels, progress=told, **options).summary()
     else:
         how, which = _chosen(Meshing, options), _chosen(Labelling, options)
-        lines = mesh_coarser(labels, ratio=ratio, labelling=which, meshing=how, watch=watch, **options).summary()
+        lines = mesh_coarser(labels, ratio=ratio, labelling=which, meshing=how, progress=told, **options).summary()
     return StageResult(tuple(lines), headline=lines[0])
 
 
@@ -105,7 +109,7 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
     begun: dict[str, float] = {}
 
     def told(case: str, stage: str, fraction: float) -> None:
-        if case == NOTE:  # is in the summary, too
+        if case == NOTE or stage == WRITING:  # a note is in the summary, too
             return
         begun[case] = fraction
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))

@@ -12,10 +12,10 @@ from pathlib import Path
 from dvc.errors import OutputError
 from dvc.io.result_folder import REPORT
 from mrstrain.records.progress import ALL, NOTE, OnProgress, duration
+from mrstrain.records.time_left import TimeLeft
 from mrstrain.studies.file import Study
 from mrstrain.studies.page import write_page_in_progress, write_run_report
 from mrstrain.studies.pipeline import Pipeline, StageOutcome
-from mrstrain.studies.time_left import TimeLeft
 
 OnReport = Callable[[Path], object]
 OnEnd = Callable[[Study, Mapping[str, StageOutcome]], object]

@@ -1,6 +1,7 @@
 """`accuracy`: error of a registration preset by tissue, position, strain, noise and resolution, on phantoms."""
 
 import hashlib
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -15,9 +16,10 @@ from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers
 from mrstrain.options.measurement import in_parallel
+from mrstrain.records.durations import REPORT, accuracy_runs, phantom_s
 from mrstrain.records.inputs import alone, output_folder, refuse_small_disk
 from mrstrain.records.outcome import with_reasons
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import OnProgress, expect
 from mrstrain.truth.accuracy_study import AccuracyStudy
 from phantoms import AccuracyCase, ErrorSamples, Heel, heel_grid, measure_run, motion_named
 
@@ -33,6 +35,8 @@ SEEDS = (1, 2)
 LABELS_OFF = (0, 1, -1)
 """Voxels by which bones and skin are too large in the label maps, in turn, for the engine that relies on them."""
 
+_CASE = "accuracy"  # of progress
+_log = logging.getLogger(__name__)
 _MEGABYTES = 8.0  # measured for one run's samples at 0.8 mm
 
 
@@ -58,7 +62,9 @@ def accuracy_cases(
 
 def expected_minutes(cases: Sequence[AccuracyCase], workers: int) -> float:
     """Estimated time of the cases with so many ``workers``, minutes."""
-    return sum(engine_named(case.preset).cost.phantom_seconds for case in cases) / workers / 60.0
+    voxels_mm3 = [float(np.prod(case.spacing_mm)) for case in cases]
+    runs = zip(cases, voxels_mm3, strict=True)
+    return sum(phantom_s(engine_named(case.preset).cost, voxel) for case, voxel in runs) / workers / 60.0
 
 
 def accuracy(
@@ -112,10 +118,16 @@ def accuracy(
             f"already done: {len(wanted) - len(missing)}."
         )
     with output_folder(folder), alone(target):
-        failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
+        if missing:
+            expect(progress, {_CASE: accuracy_runs(_named(missing), 60.0 * expected_minutes(missing, at_once))})
+        tell = progress or (lambda *_: None)
+        failures = _measure_all(missing, at_once, folder, runs, tell)
         if not runs:
             raise MrstrainError(with_reasons("No case could be measured.", [f"{n}: {r}" for n, r in failures.items()]))
-        return AccuracyStudy.of(target, [runs[name] for name in sorted(runs)], failures)
+        tell(_CASE, REPORT, 0.0)
+        study = AccuracyStudy.of(target, [runs[name] for name in sorted(runs)], failures)
+        tell(_CASE, REPORT, 1.0)
+        return study
 
 
 def _finished(folder: Path) -> dict[str, ErrorSamples]:
@@ -157,6 +169,11 @@ def _key(case: AccuracyCase) -> str:
     return hashlib.sha256(f"{engine_named(case.preset).text}; {software_key('phantoms')}".encode()).hexdigest()
 
 
+def _named(cases: Sequence[AccuracyCase]) -> str:
+    """What is done with cases, in words."""
+    return f"{len(cases)} registration{'s' * (len(cases) > 1)}"
+
+
 def _measure_all(
     cases: Sequence[AccuracyCase], at_once: int, folder: Path, runs: dict[str, ErrorSamples], progress: OnProgress
 ) -> dict[str, str]:
@@ -164,13 +181,12 @@ def _measure_all(
     computing, reporting = threading.Lock(), threading.Lock()
     failures: dict[str, str] = {}
     fractions: dict[str, float] = {}
-    of_all = f"{len(cases)} registration{'s' * (len(cases) > 1)}"
 
     def report(name: str, fraction: float) -> None:
         with reporting:
             fractions[name] = fraction
             # relative to the cases of this call, so that the time left is that of this call
-            progress("accuracy", of_all, sum(fractions.values()) / len(cases))
+            progress(_CASE, _named(cases), sum(fractions.values()) / len(cases))
 
     def measure_one(case: AccuracyCase, worker: Worker) -> None:
         try:
@@ -179,6 +195,7 @@ def _measure_all(
             runs[case.name] = samples
         except MrstrainError as error:
             failures[case.name] = str(error)
+            _log.info("%s failed", case.name, exc_info=error)
         report(case.name, 1.0)
 
     each_in_workers(cases, measure_one, at_once=at_once, threads=1)

@@ -47,6 +47,7 @@ _RATIO = np.sqrt(10.0)
 _POWERS = -4, 3  # powers of the ratio that are tried at the most: weights of 0.03 to 95
 _MIDDLE = 0.7  # of each edge of the mask's box
 _LAST_STEPS = 2
+_DONE = (0.05, 0.12, 0.38, 0.62, 0.87)  # of the time, after each level and after the choice of the bending
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,7 @@ def fit(
             if choice.frees_volume:
                 weights = replace(weights, volume=0.0, volume_gradient=_FREED)
         guess = BSpline(control, turned(axes, coefficients))
-        progress((number + 1) / (len(LEVELS) + 2))
+        progress(_DONE[number])
     choice = replace(choice, weights=weights)
     level.roughness = level.following(coefficients)
     if parameters.bending is None:
@@ -131,7 +132,7 @@ def fit(
         middle = Level(pictures, inside & part, soft & part, core & part, level.roughness, rest=rest)
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
         del middle  # its memory goes to the last steps
-        progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
+        progress(_DONE[-1])
     steps = _LAST_STEPS * choice.weights.patience
     found = level.descend(coefficients, choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
     progress(1.0)

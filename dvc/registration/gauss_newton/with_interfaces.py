@@ -38,7 +38,7 @@ _SKIN_MARGIN = 5e-4  # of the left-out residual: skin is stiff unless the images
 _STEPS = 3
 _LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps does it better with one
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
-_SMOOTH_SHARE = 0.4  # of the time
+_SMOOTH_SHARE, _DONE = 0.3, (0.6, 0.72, 0.85)  # of the time: the smooth fit, then after each of the other steps
 STAGE = {
     "usual_skin": USUAL_SKIN, "powers": _SKIN_POWERS, "margin": _SKIN_MARGIN, "laplacians": _LAPLACIANS,
     "steps": _STEPS, "of_jumps": [_BENDING, _SQUARE], "distances": NUMBERS,
@@ -66,14 +66,14 @@ def fit_with_interfaces(
     coefficients: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
     coefficients = stage.whole.descend(coefficients, weights, steps=steps, stop_mm=stop_mm).coefficients
     stage.whole.roughness = stage.slab.roughness = stage.whole.following(coefficients)
-    progress(_SMOOTH_SHARE + 0.1)
+    progress(_DONE[0])
     if skin is not None:
         in_skin = Choice(weights, "rigidity fixed beforehand")
     elif stage.slab_has_skin:
         in_skin = choose(stage.slab, coefficients, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
     else:
         in_skin = Choice(weights, "rigidity at its default, because the image shows too little skin")
-    progress(_SMOOTH_SHARE + 0.3)
+    progress(_DONE[1])
     choice = Choice(in_skin.weights, "bending fixed beforehand")
     if parameters.bending is None:
         choice = choose(stage.slab, coefficients, in_skin.weights)
@@ -82,7 +82,7 @@ def fit_with_interfaces(
     choice = replace(
         choice, rule=rule, tried_in_skin=in_skin.tried, at_interfaces=True, asked=first.asked, in_bone=in_bone
     )
-    progress(_SMOOTH_SHARE + 0.5)
+    progress(_DONE[2])
     del stage.slab  # its memory goes to the last steps
     found = stage.whole.descend(coefficients, choice.weights, steps=steps, stop_mm=stop_mm)
     progress(1.0)

@@ -39,7 +39,10 @@ def test_a_command_does_not_greet_and_one_that_there_is_not_is_refused() -> None
     ("given", "told"),
     [
         (["Load0.nii.gz"], "Missing argument 'loads'. Loaded images."),
-        (["Load0.nii.gz", "Load1.nii.gz"], "Missing option '--out'. Folder for the results; created if missing."),
+        (
+            ["Load0.nii.gz", "Load1.nii.gz"],
+            "Missing option '--out'. Folder for the results and log.txt; created if",
+        ),
     ],
 )
 def test_what_is_missing_is_told_with_what_it_is(given: list[str], told: str) -> None:

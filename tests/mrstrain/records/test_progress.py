@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import re
+import time
 
 import pytest
 from rich.console import Console
 
 from mrstrain.records import progress
+from mrstrain.records.time_left import FAILED, Expected
 from tests.processes import wait_for
 
 
@@ -33,6 +35,68 @@ def test_lines_come_now_and_then_with_the_time_left(clock: list[float], capsys: 
         "Load1: registering 60 % after 36 s, 24 s left",
         "Load1: registering 100 % after 60 s",
     ]
+
+
+PARTS = {"aligning": 10.0, "registering": 20.0, "strain and figures": 10.0}
+LOADS = {"Load1": Expected.of(PARTS), "Load2": Expected.of(PARTS), "report": Expected(2.0)}
+TOLD = (
+    (0, "Load1", "aligning", 0.0), (10, "Load1", "aligning", 1.0), (10, "Load1", "registering", 0.0),
+    (20, "Load1", "registering", 0.5), (30, "Load1", "registering", 1.0), (30, "Load1", "strain and figures", 0.0),
+    (40, "Load1", "strain and figures", 1.0), (40, "Load2", "aligning", 0.0), (45, "Load2", FAILED, 1.0),
+    (45, "report", "writing", 0.0), (47, "report", "writing", 1.0),
+)  # fmt: skip
+
+
+def test_a_command_that_tells_what_it_expects_has_one_line_with_the_time_left_of_all(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress.live() as told:
+        progress.expect(told, LOADS)
+        progress.expect(told, {"Load1": Expected(1e6)})  # by a command that it calls
+        for second, case, stage, fraction in TOLD:
+            clock[0] = 1000.0 + second
+            told(case, stage, fraction)
+    lines = capsys.readouterr()
+    assert lines.out == ""
+    assert lines.err.splitlines() == [
+        "starting (0 % after 0 s)",
+        "Load1: aligning (0 % after 0 s)",
+        "Load1: registering (12 % after 10 s, about 72 s left)",
+        "Load1: registering (37 % after 30 s, about 52 s left)",
+        "Load1: strain and figures (37 % after 30 s, about 52 s left)",
+        "Load2: aligning (49 % after 40 s, about 42 s left)",
+        "report: writing (98 % after 45 s, about 1 s left)",
+        "finished after 47 s",
+    ]
+
+
+def test_in_a_terminal_it_has_one_bar() -> None:
+    file = io.StringIO()
+    with progress.live(console=Console(file=file, force_terminal=True, width=100, height=24)) as told:
+        progress.expect(told, LOADS, 2)
+        for case in ("Load1", "Load2"):
+            told(case, "aligning", 1.0)
+            told(case, "registering", 0.5)
+        wait_for(lambda: "registering" in " ".join(screen(file.getvalue(), 24)))
+        shown = screen(file.getvalue(), 24)
+    assert len(shown) == 1
+    assert shown[0].startswith("Load1: registering; Load2: registering")
+
+
+def test_a_whole_that_is_silent_is_told_all_the_same_and_one_that_failed_is_not_called_finished(monkeypatch) -> None:
+    monkeypatch.setattr(progress, "_TOLD_EVERY_S", 0.01)
+    shown: list[tuple[str, str, float]] = []
+    whole = progress.Live(lambda *one: shown.append(one), lambda *_: None, time.monotonic())
+    whole.expect(LOADS, 1)
+    whole("Load1", "aligning", 0.0)
+    wait_for(lambda: len(shown) > 5)
+    assert {one[:2] for one in shown} == {("all", "starting"), ("all", "Load1: aligning")}
+    whole.stop()
+    monkeypatch.undo()
+    failed = pytest.raises(ValueError, match="no")
+    with failed, progress.live() as told:
+        progress.expect(told, LOADS)
+        raise ValueError("no")
 
 
 def test_what_takes_longer_than_expected_is_never_called_done(

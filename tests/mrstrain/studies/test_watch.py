@@ -13,13 +13,13 @@ import pytest
 from dvc.report.page import Picture, Section, Table
 from dvc.trust.verdict import Verdict
 from mrstrain.records.progress import ALL
+from mrstrain.records.time_left import Expected, TimeLeft
 from mrstrain.studies import watch as watching
 from mrstrain.studies.file import Study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline, StageOutcome
 from mrstrain.studies.plan import plan
 from mrstrain.studies.stages import StageResult
-from mrstrain.studies.time_left import Expected, TimeLeft
 from mrstrain.studies.watch import Follower, Report, Watch
 from tests.mrstrain.studies.test_page import record, study
 from tests.processes import wait_for

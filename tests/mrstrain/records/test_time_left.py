@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from mrstrain.records.time_left import FAILED, Expected, Pace, TimeLeft, seconds_to_end
 from mrstrain.studies import costs
 from mrstrain.studies.file import read_study
 from mrstrain.studies.plan import plan
-from mrstrain.studies.time_left import Expected, Pace, TimeLeft, seconds_to_end
 
 ROOT = Path(__file__).resolve().parents[3]
 LOADS = tuple(f"register Load{n}" for n in (1, 2, 3, 4))
@@ -86,7 +86,7 @@ Run = dict[str, tuple[int, int]]
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     now = [0.0]
-    monkeypatch.setattr("mrstrain.studies.time_left.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("mrstrain.records.time_left.time.monotonic", lambda: now[0])
     return now
 
 
@@ -220,3 +220,25 @@ def test_what_never_began_ends_without_a_time(clock: list[float]) -> None:
     left.end("b")  # as it waited for one that failed
     assert left.seconds() == 0.0
     assert left._pace({}).of(Expected(10.0)) == 1.0
+
+
+def test_a_stage_that_tells_how_far_it_is_needs_no_end_to_correct_the_pace(clock: list[float]) -> None:
+    parts = {"aligning": 10.0, "registering": 30.0, "strain and figures": 10.0}
+    one = Expected.of(parts, kind="register")
+    assert one.seconds == 50.0
+    assert one.share("registering", 0.5) == 0.5
+    assert one.share("registering", 1.0) == 0.8
+    assert one.share("strain and figures", 1.0) == one.share(FAILED, 1.0) == 1.0
+    assert one.share("reading", 1.0) == 0.0  # unknown
+    assert Expected(5.0).share("simulating", 0.3) == 0.3
+    left = TimeLeft.of_command({"Load1": one, "Load2": one}, 1, 1.5)
+    for second, part, fraction in ((0.0, "aligning", 0.0), (30.0, "aligning", 1.0), (30.0, "registering", 0.0)):
+        clock[0] = second
+        left.told("Load1", part, fraction)
+    # a third as fast, (T + 31.5) / (T + 11.5) with T = 10 s and the start; then once more for the kind, with 5.3 T
+    assert left.seconds() == pytest.approx(90.0 * (53.3 * 41.5 / 21.5 + 30.0) / (53.3 + 10.0), rel=0.001)
+    clock[0] = 1e4  # silent for long
+    assert left.seconds() > 2e3
+    for case in ("Load1", "Load2", "Load3"):
+        left.told(case, FAILED, 1.0)
+    assert left.seconds() == 0.0
