@@ -22,6 +22,7 @@ from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
 from mrstrain.measurement.acquisition import scans_record
 from mrstrain.measurement.answer import measured_strain
+from mrstrain.measurement.auto_labels import check_auto, labelled, next_step
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.plan import Plan, record_of
@@ -29,7 +30,6 @@ from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import (
     AUTO,
-    MADE_LABELS,
     MeshAndAxes,
     RegistrationOptions,
     Running,
@@ -40,7 +40,6 @@ from mrstrain.options.model import Flag
 from mrstrain.records.inputs import (
     alone,
     case_names,
-    made_labels,
     output_folder,
     read_subject,
     refuse_small_disk,
@@ -90,7 +89,7 @@ def register(
     refuse_touching_inputs(target, cases, [load0, *paths, *given])
     align, tell = registration.align, progress or (lambda *_: None)
     if subject_files.labels == AUTO:
-        _check_auto(subject_files, cases, scans)
+        check_auto(subject_files, cases, scans)
     elif align == "bone" and subject_files.bone is None and subject_files.bone_label is None:
         if subject_files.labels is not None:
             raise InputError(
@@ -114,7 +113,7 @@ def register(
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
         if subject_files.labels == AUTO:
             _hold(target, stack)
-            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
+            subject_files, of_labels = labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         subject = replace(subject, tissue=subject.body())
         # Its rigid motion is found by aligning.
@@ -142,44 +141,14 @@ def register(
         finished = run.finished()
     shown = [case for case in finished if case.name != REPEAT]
     answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
-    return Series.of(target, finished, run.failures, record, answer, of_labels)
+    advice = next_step(subject_files, cases, scans, registration, chosen)
+    return Series.of(target, finished, run.failures, record, answer, of_labels, advice=advice)
 
 
 def _hold(out: Path, stack: ExitStack) -> None:
     """Make the output folder, and refuse it to other runs until the stack is closed."""
     stack.enter_context(output_folder(out))
     stack.enter_context(alone(out))
-
-
-def _check_auto(files: SubjectFiles, cases: Sequence[str], scans: Scans) -> None:
-    """InputError if the label map cannot be made from the image."""
-    if files.bone is None:
-        raise InputError("labels auto also needs the mask of the bone: `bone` (--bone on the command line).")
-    if files.names is not None or files.bone_label is not None:
-        raise InputError(
-            "`names` and `bone_label` need a label map of your own; they cannot be used with labels auto (on the "
-            "command line: --names, --bone-label, --labels auto)."
-        )
-    if scans.allow_missing:
-        raise InputError(
-            "labels auto cannot be combined with `allow_missing` (--allow-missing on the command line): the image must "
-            "not have missing voxels."
-        )
-    folder = Path(MADE_LABELS).parts[0]
-    if folder in map(one_spelling, cases):
-        raise InputError(f"A loaded image is named '{folder}', as the folder of the label map; rename it.")
-
-
-def _labelled(
-    load0: Path, files: SubjectFiles, out: Path, tell: Callable[[float], None]
-) -> tuple[SubjectFiles, tuple[Section, ...]]:
-    """Make the label map; the files with it, and its section of the report."""
-    from mrstrain.measurement.label import label  # with it come skimage.restoration and scipy.stats: 0.7 s
-
-    labels, names = made_labels(out)
-    tell(0.0)
-    made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, watch=tell)
-    return files.model_copy(update={"labels": labels, "names": names}), (made.section,)
 
 
 class InSeries(Running):
