@@ -48,8 +48,8 @@ def label(
 ) -> None:  # fmt: skip
     """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few strokes.
 
-    With --from and --labels, transfer the label map of another subject; with --labels alone, correct an existing label
-    map of this image.
+    With --from and --labels, transfer the label map of another subject; with --labels alone or with --marks, correct an
+    existing label map of this image.
     """
     from dvc.errors import InputError
 
