@@ -14,6 +14,7 @@ from mrstrain.options.measurement import (
     ExistingFiles,
     GivenLabels,
     Marks,
+    MarksForAuto,
     MeshAndAxes,
     RegistrationOptions,
     Running,
@@ -72,7 +73,7 @@ def label(
 def register(
     load0: Load0,
     loads: Annotated[list[Path], typer.Argument(help="Loaded images.")], out: Out, subject_files: SubjectFiles,
-    registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
+    strokes: MarksForAuto, registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
 ) -> None:  # fmt: skip
     """Measure displacement and strain between an unloaded image and loaded ones, with a verdict and a report."""
     from dvc.worker import Worker
@@ -83,7 +84,7 @@ def register(
         worker.start("dvc.registration.align", "dvc.registration.gauss_newton.engine")
         carry_out(
             mrstrain.register.with_options, load0, loads, out=out, subject_files=subject_files,
-            registration=registration, scans=scans, onto=onto, running=running, worker=worker,
+            strokes=strokes, registration=registration, scans=scans, onto=onto, running=running, worker=worker,
         )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import (
     AUTO,
+    MarksForAuto,
     MeshAndAxes,
     RegistrationOptions,
     Running,
@@ -55,7 +56,7 @@ _BYTES_PER_VOXEL = 35  # of one image's results: 27 as measured, 5 with the plat
 @door
 def register(
     load0: Path | str, loads: Sequence[Path | str], *, out: Path | str, subject_files: SubjectFiles,
-    registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
+    strokes: MarksForAuto, registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
     progress: OnProgress | None = None, worker: Worker | None = None,
 ) -> Series:  # fmt: skip
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
@@ -68,7 +69,7 @@ def register(
         Unloaded image (reference configuration).
     loads : paths
         Loaded images. Each gets a folder in ``out`` named after its file.
-    subject_files
+    subject_files, strokes
         With labels "auto", `label` makes the label map first, in the folder ``labels`` of ``out``.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
@@ -85,11 +86,16 @@ def register(
     cases, paths = list(places), list(places.values())
     chosen = engine_of(registration, labelled=subject_files.labels is not None)
     _check_start(scans, chosen)
-    given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
+    given = [p for of in (subject_files, strokes, registration, scans, onto) for p in of.paths]
     refuse_touching_inputs(target, cases, [load0, *paths, *given])
     align, tell = registration.align, progress or (lambda *_: None)
     if subject_files.labels == AUTO:
-        check_auto(subject_files, cases, scans)
+        check_auto(subject_files, strokes, cases, scans)
+    elif strokes.paths:
+        raise InputError(
+            "`marks` and `mark_names` are for labels auto (--marks, --mark-names, --labels auto on the command line). "
+            "To correct a label map with strokes, use `mrstrain label --labels ... --marks ...`."
+        )
     elif align == "bone" and subject_files.bone is None and subject_files.bone_label is None:
         if subject_files.labels is not None:
             raise InputError(
@@ -113,7 +119,8 @@ def register(
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
         if subject_files.labels == AUTO:
             _hold(target, stack)
-            subject_files, of_labels = labelled(load0, subject_files, target, partial(tell, "labels", "tissues"))
+            making = partial(tell, "labels", "tissues")
+            subject_files, of_labels = labelled(load0, subject_files, strokes, target, making)
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         subject = replace(subject, tissue=subject.body())
         # Its rigid motion is found by aligning.
@@ -126,7 +133,7 @@ def register(
         refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
         settings = Settings(chosen, align, running.seed, threads)
         model = model or error_model_of(chosen.name)
-        files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}}
+        files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}, **strokes.files}
         more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
         more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
         more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}

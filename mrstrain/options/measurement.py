@@ -59,6 +59,14 @@ class Marks(Options):
     other."""
 
 
+class MarksForAuto(Marks):
+    """A few strokes on the unloaded image, from which its label map is made."""
+
+    marks: Path | None = None
+    """With --labels auto: strokes in a few tissues, as in `mrstrain label`. With a stroke in the bone, --bone is not
+    needed."""
+
+
 class GivenLabels(Options):
     """A label map: of this image, to be corrected, or of another subject's, to be transferred."""
 
@@ -83,7 +91,7 @@ class SubjectFiles(BoneAndBody):
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
-    """Label map of the tissues on the unloaded image, or auto to make it from the image and --bone."""
+    """Label map of the tissues on the unloaded image, or auto to make it from the image and --bone or --marks."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
 
