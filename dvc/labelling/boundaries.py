@@ -97,10 +97,10 @@ def correct_labels(
     if not labels.grid.same_as(grid):
         raise InputError("The labels are on another grid than the image; resample them with `fit_mask`.")
     if marks is not None:
-        drawn = TissueLabels(labels, certain(labels) if probability is None else probability)
-        found = corrected_near(image, drawn, marks)
+        before = TissueLabels(labels, certain(labels) if probability is None else probability)
+        after = corrected_near(image, before, marks)
         watch(1.0)
-        return CorrectedLabels(found.labels, _changed(labels, found.labels), {}, found.notes, found.probability)
+        return CorrectedLabels(after.labels, _changed(labels, after.labels), {}, after.notes, after.probability)
     if probability is not None:
         raise InputError("The probability of each tissue (probability) can be corrected by marks only: give both.")
     bones, skin = correctable(labels)
