@@ -5,8 +5,10 @@ from __future__ import annotations
 import pkgutil
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,11 +17,12 @@ from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
 import fe
-from dvc import Grid, Image, StrainField
+from dvc import Grid, Image, StrainField, read_image
 from dvc.io.images.labels import read_labels
 from dvc.io.images.write import write_image, write_mask
 from fe import read_material_sets
 from mrstrain.cli.app import app
+from mrstrain.measurement.strokes import read_marks
 from mrstrain.studies.file import read_study
 from mrstrain.truth.phantom import phantom
 from phantoms import Heel, under_load
@@ -109,6 +112,35 @@ def test_the_lines_of_the_readme(
 def test_dvc_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy_scans(tmp_path)
     follow("python/dvc.md", tmp_path, monkeypatch)
+
+
+def test_strokes_that_were_drawn_in_napari_are_saved_on_the_grid_of_the_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a stand-in for napari, in whose place somebody draws a stroke of fat and closes the window."""
+    copy_scans(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    layers: list[np.ndarray] = []
+
+    class Viewer:
+        def add_image(self, data: np.ndarray, *, scale: np.ndarray) -> None:
+            assert data.ndim == len(scale)
+
+        def add_labels(self, data: np.ndarray, *, scale: np.ndarray) -> SimpleNamespace:
+            layers.append(data)
+            return SimpleNamespace(data=data)
+
+    def run() -> None:
+        layers[0][2:5, 7, 9] = 2
+
+    monkeypatch.setitem(sys.modules, "napari", SimpleNamespace(Viewer=Viewer, run=run))
+    blocks = Sybil(parsers=[PythonCodeBlockParser()]).parse(DOCS / "measure.md").examples()
+    (block,) = [block for block in blocks if "napari" in block.parsed]
+    block.evaluate()
+    saved = read_marks(tmp_path / "strokes.nii.gz", None)
+    assert saved.names == {2: "fat"}
+    assert np.argwhere(saved.labels).tolist() == [[2, 7, 9], [3, 7, 9], [4, 7, 9]]
+    assert saved.grid.same_as(read_image(tmp_path / "Load0.nii.gz").grid)
 
 
 @pytest.mark.usefixtures("in_this_process")

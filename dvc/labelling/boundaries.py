@@ -1,8 +1,8 @@
-"""Boundaries of bones and skin in a label map that was drawn, moved to where the image shows them."""
+"""A label map that was drawn or made before, corrected: by the image, or near a few marks."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label, maximum
@@ -16,7 +16,9 @@ from dvc.images.depth import depth_mm
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import tissue_mask, within
+from dvc.labelling.near_marks import certain, corrected_near
 from dvc.labelling.skin import Skin
+from dvc.labelling.tissues import TissueLabels
 from dvc.measurement.subject import is_bones_name
 
 _REACH = 2.5  # voxels, of a border that is moved
@@ -31,33 +33,41 @@ _LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the im
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedLabels:
-    """A label map with corrected boundaries.
+    """A label map that was corrected.
 
     Attributes
     ----------
     labels : LabelMap
-        On the image's grid; the outline of the body, and boundaries between soft tissues, are as given.
+        On the image's grid; the outline of the body is as given.
     changed : float
         Share of the labelled voxels that have another label.
     moved_mm : mapping
         Mean and root mean square of how far the boundaries of "bone" and "skin" moved, mm, by name: above zero where
-        the bone grew, or the skin became thicker.
+        the bone grew, or the skin became thicker. Empty with marks.
     notes : tuple of str
         What was left as it was, and why.
+    probability : (n, ni, nj, nk) float32 or None
+        With marks: probability of each tissue, in the order of ``labels.names``.
     """
 
     labels: LabelMap
     changed: float
     moved_mm: Mapping[str, tuple[float, float]]
     notes: tuple[str, ...] = ()
+    probability: Float32Array | None = field(default=None, repr=False)
 
 
 @checked
-def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None] = lambda _: None) -> CorrectedLabels:
-    """Move the boundaries of bones and skin to where the image shows them, by up to 2.5 times the mean voxel edge.
+def correct_labels(
+    image: Image, labels: LabelMap, marks: LabelMap | None = None, probability: Float32Array | None = None,
+    watch: Callable[[float], None] = lambda _: None,
+) -> CorrectedLabels:  # fmt: skip
+    """Correct a label map near a few marks; or, without marks, the boundaries of its bones and skin.
 
-    A bone ends where its dark rim becomes as bright as the tissue beside it; skin ends where the brightness below the
-    surface rises. Where the image shows no such edge, the boundary stays. What becomes bone or soft tissue gets the
+    With marks, labels within 8 mm of a mark that they do not agree with are found again, and all others are kept.
+    Without, the boundaries of bones and skin move to where the image shows them, by up to 2.5 times the mean voxel
+    edge. A bone ends where its dark rim becomes as bright as the tissue beside it; skin ends where the brightness below
+    the surface rises. Where the image shows no such edge, the boundary stays. What becomes bone or soft tissue gets the
     nearest label of that kind.
 
     Parameters
@@ -66,17 +76,33 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
         Unloaded image, in which fat is brighter than skin and cortical bone.
     labels : LabelMap
         Tissues on the image's grid. Bones are the labels that are named like one, and skin is the one named "skin".
+    marks : LabelMap, optional
+        A few voxels of each tissue, by name, on any grid of the image's frame. A tissue that the labels do not have is
+        added to them. Of the tissues near a mark, only its own and those that it contradicts change.
+    probability : (n, ni, nj, nk), optional
+        With marks: probability of each tissue, in the order of ``labels.names``, such as `label_tissues` gives.
+        Default: that of a drawn label, 1.
     watch : callable, optional
         Told how far it is, from 0 to 1.
 
     Raises
     ------
     InputError
-        If the labels are on another grid, or none is a bone or skin.
+        If the labels are on another grid; without marks, if none is a bone or skin; with marks, if the labels have no
+        names or the probability is not theirs.
+    GeometryError
+        If the marks do not lie on the image.
     """
     grid, given, spacing = image.grid, labels.labels, image.grid.spacing_mm
     if not labels.grid.same_as(grid):
         raise InputError("The labels are on another grid than the image; resample them with `fit_mask`.")
+    if marks is not None:
+        before = TissueLabels(labels, certain(labels) if probability is None else probability)
+        after = corrected_near(image, before, marks)
+        watch(1.0)
+        return CorrectedLabels(after.labels, _changed(labels, after.labels), {}, after.notes, after.probability)
+    if probability is not None:
+        raise InputError("The probability of each tissue (probability) can be corrected by marks only: give both.")
     bones, skin = correctable(labels)
     watch(0.1)
     even, body, reach = fill_missing(without_bias_field(image)), given > 0, _REACH * float(spacing.mean())
@@ -111,8 +137,8 @@ def correct_labels(image: Image, labels: LabelMap, watch: Callable[[float], None
         if (before & body).any()
     }
     watch(1.0)
-    changed = float(np.mean(corrected[body] != given[body]))
-    return CorrectedLabels(LabelMap(grid, corrected, labels.names), changed, moved, tuple(notes))
+    made = LabelMap(grid, corrected, labels.names)
+    return CorrectedLabels(made, _changed(labels, made), moved, tuple(notes))
 
 
 def correctable(labels: LabelMap) -> tuple[BoolArray, BoolArray]:
@@ -123,6 +149,12 @@ def correctable(labels: LabelMap) -> tuple[BoolArray, BoolArray]:
     if not (bones.any() or skin.any()):
         raise InputError("No label is named skin, or like a bone, so there is no boundary to correct. Check the names.")
     return bones, skin
+
+
+def _changed(before: LabelMap, after: LabelMap) -> float:
+    """Share of the labelled voxels that have another label."""
+    body = before.labels > 0
+    return float(np.mean(after.labels[body] != before.labels[body]))
 
 
 def _without_labels(image: Image, body: BoolArray, spacing_mm: FloatArray, reach_mm: float) -> BoolArray:

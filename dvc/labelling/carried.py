@@ -17,6 +17,7 @@ from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.labels import fit_mask
 from dvc.labelling.boundaries import correct_labels
+from dvc.labelling.near_marks import corrected_near
 from dvc.labelling.tissues import NAMES, TissueLabels, label_tissues
 from dvc.measurement.subject import bones_of, is_bones_name
 from dvc.registration.affine_fit import affine_fit, parts_of
@@ -43,7 +44,7 @@ class CarriedLabels:
 @checked
 def labels_from(
     image: Image, other: Image, labels: LabelMap, bone: Mask | None = None, body: Mask | None = None,
-    watch: Callable[[float], None] = lambda _: None,
+    marks: LabelMap | None = None, watch: Callable[[float], None] = lambda _: None,
 ) -> TissueLabels:  # fmt: skip
     """Label the tissues of an unloaded image, given another subject's image and its label map.
 
@@ -64,6 +65,9 @@ def labels_from(
         The bone, if it is known, on any grid of the image's frame; it is kept unchanged.
     body : Mask, optional
         The body in the image. Default: found by an intensity threshold.
+    marks : LabelMap, optional
+        A few voxels of each tissue, by name, on any grid of the image's frame. Where they do not agree with the labels,
+        these are corrected as in `correct_labels`.
     watch : callable, optional
         Called with the fraction that is done, 0 to 1.
 
@@ -89,7 +93,8 @@ def labels_from(
     whole = fit_mask(body, image.grid, "body") if body is not None else tissue_mask(image)
     theirs = fit_mask(labels, other.grid, "labels")
     carried = carry_labels(image, other, theirs, whole, lambda share: watch(0.7 * share))
-    return combined(image, other, theirs, carried, bone, whole, lambda share: watch(0.7 + 0.3 * share))
+    made = combined(image, other, theirs, carried, bone, whole, lambda share: watch(0.7 + 0.3 * share))
+    return made if marks is None else corrected_near(image, made, marks, bone)
 
 
 def carry_labels(
@@ -123,7 +128,7 @@ def combined(
     """Transferred labels (`carry_labels`), combined with the tissues that the image shows in the body."""
     (name, *_), known = bones_of(labels), bone
     if known is None:
-        known = correct_labels(image, carried.labels, lambda share: watch(0.4 * share)).labels.region(name)
+        known = correct_labels(image, carried.labels, watch=lambda share: watch(0.4 * share)).labels.region(name)
     found = label_tissues(image, known, body, watch=lambda share: watch(0.4 + 0.6 * share))
     return _weighed(found, carried, _groups(found, other, labels, name))
 

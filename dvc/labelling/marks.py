@@ -14,7 +14,7 @@ from dvc.labelling.brightness import Levels, brighter_share
 
 _BORDER_MM = 0.1  # of a marked tissue, which may be a sheet of two voxels
 _REACH_MM = 8.0  # of a correction
-_BLUR_MM = 0.5
+_BLUR_MM, _TRUNCATED = 0.5, 4.0  # standard deviation of a Gaussian, and how many of them it reaches
 _EVEN = 3.0  # times the median step between neighbouring voxels: a walk avoids larger steps
 _LEAST_WEIGHT = 1e-4
 _CONVERGED = 1e-5
@@ -51,7 +51,8 @@ def corrected(
 
     There each voxel gets the tissue that a random walk from it most likely reaches first: a mark, or the tissues
     beyond 8 mm as they are (L. Grady 2006, doi:10.1109/TPAMI.2006.233). A walk avoids steps of brightness, and what has
-    the tissue that a mark contradicts, but the brightness of the mark.
+    the tissue that a mark contradicts, but the brightness of the mark. Only the tissues of these marks and those that
+    they contradict change: beside a mark of muscle in fat, skin and bone stay as they are.
 
     Parameters
     ----------
@@ -73,24 +74,35 @@ def corrected(
     for number, mark in marks.items():
         wrong |= mark & (labels != number + 1)
         fixed[mark] = number + 1
-    blurred = gaussian_filter(values, _BLUR_MM / grid.spacing_mm)
-    near = within(wrong, grid.spacing_mm, _REACH_MM)
-    parts, count = label(near)
+    parts, count = label(within(wrong, grid.spacing_mm, _REACH_MM))
     for part in range(1, count + 1):
         box = Mask(grid, parts == part).box(around=2)
-        again = (parts[box] == part) & (labels[box] > 0)
-        doubted = _as_the_marks(blurred[box], labels[box], wrong[box] & again)
-        seeds = np.where(again, 0, np.where(doubted, -1, labels[box]))
-        seeds = np.where(fixed[box] > 0, fixed[box], seeds)
+        here, marked, blurred = labels[box], fixed[box], _blurred(values, box, grid.spacing_mm)
+        at = wrong[box] & (parts[box] == part)
+        concerned = np.unique(np.concatenate([here[at], marked[at]]))
+        here, marked = (np.where(np.isin(of, concerned), of, none) for of, none in ((here, -1), (marked, 0)))
+        again = (parts[box] == part) & (here > 0)
+        doubted = _as_the_marks(blurred, here, at)
+        seeds = np.where(again, 0, np.where(doubted, -1, here))
+        seeds = np.where(marked > 0, marked, seeds)
         present = np.unique(seeds[seeds > 0])
         numbered = np.where(seeds > 0, np.searchsorted(present, seeds) + 1, seeds)
-        walked = _walked(blurred[box], numbered, len(present), grid.spacing_mm)
+        walked = _walked(blurred, numbered, len(present), grid.spacing_mm)
         total = walked.sum(axis=0)  # 1, but for what conjugate gradients leave, and 0 where no walk reaches a seed
-        inside = (again | (fixed[box] > 0)) & (total > _REACHED)
+        inside = again & (total > _REACHED)
         chance = np.zeros((len(found), *seeds.shape), dtype=np.float32)
         chance[present - 1] = walked / np.maximum(total, _REACHED)
         found[(slice(None), *box)] = np.where(inside, chance, found[(slice(None), *box)])
     return found
+
+
+def _blurred(values: Float32Array, box: tuple[slice, ...], spacing_mm: FloatArray) -> Float32Array:
+    """Values in a box of the image, blurred as in the whole of it."""
+    sigma = _BLUR_MM / spacing_mm
+    reach = np.rint(_TRUNCATED * sigma + 0.5).astype(int)
+    wider = tuple(slice(max(one.start - int(n), 0), one.stop + int(n)) for one, n in zip(box, reach, strict=True))
+    inner = tuple(slice(one.start - w.start, one.stop - w.start) for one, w in zip(box, wider, strict=True))
+    return np.asarray(gaussian_filter(values[wider], sigma, truncate=_TRUNCATED)[inner], dtype=np.float32)
 
 
 def _as_the_marks(values: Float32Array, labels: IntArray, marks: BoolArray) -> BoolArray:

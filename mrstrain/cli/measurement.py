@@ -14,6 +14,7 @@ from mrstrain.options.measurement import (
     ExistingFiles,
     GivenLabels,
     Marks,
+    MarksForAuto,
     MeshAndAxes,
     RegistrationOptions,
     Running,
@@ -53,8 +54,8 @@ def label(
 ) -> None:  # fmt: skip
     """Make a label map of skin, fat, muscle and bones from the unloaded image, with a bone mask or a few strokes.
 
-    With --from and --labels, transfer the label map of another subject; with --labels alone, correct an existing label
-    map of this image.
+    With --from and --labels, transfer the label map of another subject; with --labels alone or with --marks, correct an
+    existing label map of this image.
     """
     from dvc.errors import InputError
 
@@ -77,7 +78,7 @@ def label(
 def register(
     load0: Load0,
     loads: Annotated[list[Path], typer.Argument(help="Loaded images.")], out: Out, subject_files: SubjectFiles,
-    registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
+    strokes: MarksForAuto, registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
 ) -> None:  # fmt: skip
     """Measure displacement and strain between an unloaded image and loaded ones, with a verdict and a report."""
     from dvc.worker import Worker
@@ -88,7 +89,7 @@ def register(
         worker.start("dvc.registration.align", "dvc.registration.gauss_newton.engine")
         carry_out(
             mrstrain.register.with_options, load0, loads, out=out, subject_files=subject_files,
-            registration=registration, scans=scans, onto=onto, running=running, worker=worker,
+            strokes=strokes, registration=registration, scans=scans, onto=onto, running=running, worker=worker,
         )  # fmt: skip
 
 

@@ -107,7 +107,7 @@ def level(
             try:
                 register.with_options(
                     load0, [work / "images" / f"{load}.nii.gz"], out=registered, subject_files=subject_files,
-                    registration=how, scans=options.Scans(), onto=options.MeshAndAxes(),
+                    strokes=options.MarksForAuto(), registration=how, scans=options.Scans(), onto=options.MeshAndAxes(),
                     running=options.Running(**dict(seeded)), progress=progress,
                 )  # fmt: skip
             except (RegistrationError, WorkerError) as failed:

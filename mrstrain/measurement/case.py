@@ -84,20 +84,24 @@ class Series:
         The measured loads, in the order given; the repeat scan last, if there is one.
     failures : dict
         Name of each load that could not be registered, and why.
+    advice : str or None
+        What would lower the error, in a line.
     """
 
     out: Path
     cases: tuple[Case, ...]
     failures: dict[str, str]
+    advice: str | None = None
 
     @classmethod
     def of(
         cls, out: Path, cases: tuple[Case, ...], failures: dict[str, str], record: Mapping[str, object],
-        first: Sequence[Section] = (), more: Sequence[Section] = (),
+        first: Sequence[Section] = (), more: Sequence[Section] = (), advice: str | None = None,
     ) -> Self:  # fmt: skip
         """Write the provenance of a series and its report, one self-contained page.
 
-        The sections ``first`` come before those of the loads, which are then folded; ``more`` come last.
+        The sections ``first`` come before those of the loads, which are then folded; ``more`` come last. The ``advice``
+        stands below the verdict.
         """
         told = [case.section for case in cases]
         told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]
@@ -108,9 +112,9 @@ class Series:
         acquired = acquisition_section({case.name: case.folder for case in cases})
         told += [] if acquired is None else [acquired]
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
-        title, about = "Strain from MR image pairs", _images(record, cases)
-        write_report(out / REPORT, title, verdict, told, closing, record_lines(record), notes=about)
-        return cls(out, cases, failures)
+        title, notes = "Strain from MR image pairs", [*_images(record, cases), *([] if advice is None else [advice])]
+        write_report(out / REPORT, title, verdict, told, closing, record_lines(record), notes=notes)
+        return cls(out, cases, failures, advice)
 
     @property
     def complete(self) -> bool:
@@ -121,7 +125,7 @@ class Series:
         """Summary, a few lines."""
         lines = [line for case in self.cases for line in case.summary()]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
-        return [*lines, f"Report: {self.out / REPORT}"]
+        return [*lines, *([] if self.advice is None else [self.advice]), f"Report: {self.out / REPORT}"]
 
 
 def _images(record: Mapping[str, Any], cases: Sequence[Case]) -> list[str]:

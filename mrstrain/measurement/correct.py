@@ -1,4 +1,4 @@
-"""A drawn label map, with the boundaries of its bones and skin where the image shows them; a part of `label`."""
+"""A drawn label map, corrected near strokes, or by the image at the boundaries of bones and skin; a part of `label`."""
 
 import time
 from collections.abc import Callable
@@ -6,21 +6,26 @@ from pathlib import Path
 
 from dvc import correct_labels, fit_mask, read_image, read_labels, write_labels
 from dvc.atomic_files import write_json
+from dvc.labelling.boundaries import CorrectedLabels
 from dvc.report.drawing import Drawing
 from dvc.report.labels import changed_slices
 from dvc.report.page import Section, Table
-from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of
+from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volumes_ml
+from mrstrain.measurement.strokes import read_marks
+from mrstrain.options.measurement import GivenLabels, Marks
 from mrstrain.records.provenance import provenance
 
 
 def corrected(
-    load0: Path, labels: Path, names: Path | None, files: LabelFiles, watch: Callable[[float], None]
+    load0: Path, drawn: GivenLabels, strokes: Marks, files: LabelFiles, watch: Callable[[float], None]
 ) -> Labelled:
     """Correct a label map (`dvc.correct_labels`), and write it with its names, picture and record."""
     began, image = time.perf_counter(), read_image(load0)
-    given = fit_mask(read_labels(labels, names), image.grid, str(labels))
-    made = correct_labels(image, given, watch)
-    inputs = {"load0": load0, "labels": labels} | ({} if names is None else {"names": names})
+    assert drawn.labels is not None
+    given = fit_mask(read_labels(drawn.labels, drawn.names), image.grid, str(drawn.labels))
+    marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
+    made = correct_labels(image, given, marks, watch=watch)
+    inputs = {"load0": load0, **{role: of[0] for role, of in (drawn.files | strokes.files).items()}}
     record = provenance("label", inputs, {})
     moved = {name: {"mean_mm": mean, "rms_mm": rms} for name, (mean, rms) in made.moved_mm.items()}
     found = {"changed": made.changed, "moved": moved, "notes": list(made.notes)}
@@ -30,13 +35,30 @@ def corrected(
         shown = view_of(made.labels), image, given, made.labels
         picture = Drawing.of("Corrected label map", changed_slices, *shown).save(files.stem)
         write_json(files.beside(".json"), record | found | {"seconds": round(time.perf_counter() - began, 1)})
-    told = f"{100 * made.changed:.1f} % of the voxels have another label"
-    borders = tuple((name, mean, rms) for name, (mean, rms) in made.moved_mm.items())
-    listed = "; ".join(f"{name} {mean:+.2f} (rms {rms:.2f})" for name, mean, rms in borders)
-    outward = "Boundaries moved outward by, mm (skin: became thicker by)"
-    lines = (f"{told}; {files.picture} shows them.", f"{outward}: {listed}", *made.notes)
-    table = Table("How far boundaries moved", ("boundary of", "mean, mm", "rms, mm"), borders, f"{outward}.")
+    told, (how, table) = changed_told(made), _volumes(made) if marks is not None else _moved(made)
+    lines = (f"{told}; {files.picture} shows them.", how, *made.notes, f"Label map: {files.labels}")
     section = Section(
         "Corrected label map", None, (table,), (picture,), (f"{told}.", *made.notes), pictures_first=True
     )  # fmt: skip
-    return Labelled(files.labels, (*lines, f"Label map: {files.labels}"), headline=told, section=section)
+    return Labelled(files.labels, lines, headline=told, section=section)
+
+
+def changed_told(made: CorrectedLabels) -> str:
+    """How much of a label map was changed, in a line."""
+    return f"{100 * made.changed:.1f} % of the voxels have another label"
+
+
+def _moved(made: CorrectedLabels) -> tuple[str, Table]:
+    """How far boundaries moved, as a line and as a table."""
+    borders = tuple((name, mean, rms) for name, (mean, rms) in made.moved_mm.items())
+    listed = "; ".join(f"{name} {mean:+.2f} (rms {rms:.2f})" for name, mean, rms in borders)
+    outward = "Boundaries moved outward by, mm (skin: became thicker by)"
+    table = Table("How far boundaries moved", ("boundary of", "mean, mm", "rms, mm"), borders, f"{outward}.")
+    return f"{outward}: {listed}", table
+
+
+def _volumes(made: CorrectedLabels) -> tuple[str, Table]:
+    """Volumes of the tissues, as a line and as a table."""
+    volumes = volumes_ml(made.labels)
+    line = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
+    return line, Table("Volumes", ("tissue", "volume, mL"), tuple(volumes.items()))

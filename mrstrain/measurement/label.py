@@ -1,8 +1,7 @@
-"""`label`: a label map from the unloaded image with its bone, marks, or another subject's labels; or one corrected."""
+"""`label`: a label map from the image with its bone, marks, or another subject's labels; or one that is corrected."""
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from dvc import (
     LabelMap,
     Mask,
     TissueLabels,
+    correct_labels,
     label_tissues,
     labels_from,
     read_image,
@@ -21,14 +21,14 @@ from dvc import (
     write_vectors,
 )
 from dvc.atomic_files import write_json
-from dvc.errors import InputError, few
+from dvc.errors import InputError
 from dvc.registration.register import refuse_one_image_twice
 from dvc.report.drawing import Drawing
 from dvc.report.labels import label_slices
 from dvc.report.page import Section, Table
-from dvc.report.strokes import MARKED
-from mrstrain.measurement.correct import corrected
-from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volumes_ml
+from mrstrain.measurement.correct import changed_told, corrected
+from mrstrain.measurement.label_files import LabelFiles, Labelled, read_made, view_of, volumes_ml
+from mrstrain.measurement.strokes import read_marks
 from mrstrain.options.door import door
 from mrstrain.options.measurement import BoneAndBody, GivenLabels, Marks
 from mrstrain.records.provenance import file_hash, provenance
@@ -39,7 +39,7 @@ def label(
     load0: Path | str, *, out: Path | str, masks: BoneAndBody, strokes: Marks, drawn: GivenLabels,
     watch: Callable[[float], None] | None = None,
 ) -> Labelled:  # fmt: skip
-    """Label skin, fat, muscle and bones of an unloaded image, or correct the boundaries of its label map.
+    """Label skin, fat, muscle and bones of an unloaded image, or correct its label map.
 
     Parameters
     ----------
@@ -47,12 +47,13 @@ def label(
         Unloaded image.
     out : path
         The label map. Beside it are written the names (.csv), a picture (.png, .pdf), a record (.json), and, unless a
-        label map is corrected, the probability of each tissue (STEM_probability).
+        label map that was drawn is corrected, the probability of each tissue (STEM_probability).
     masks, strokes
         The bone, or the mark of one, is required, unless ``labels`` are given; as in `dvc.label_tissues`.
     drawn
-        Instead, ``labels`` of this image, which are corrected as in `dvc.correct_labels`; or ``labels`` of another
-        subject's image (``from_image``), which are transferred as in `dvc.labels_from`.
+        ``labels`` of this image, which are corrected as in `dvc.correct_labels`: near the strokes, or without strokes
+        at the boundaries of bones and skin. Or ``labels`` of another subject's image (``from_image``), which are
+        transferred as in `dvc.labels_from`.
     watch
         As in `dvc.label_tissues`.
 
@@ -64,17 +65,28 @@ def label(
     """
     source, tell = Path(load0), watch or (lambda _: None)
     files = LabelFiles.of(out, (source, *masks.paths, *strokes.paths, *drawn.paths))
+    before = None
     if drawn.labels is not None and drawn.from_image is None:
-        if masks.paths or strokes.paths:
-            raise InputError("A label map (--labels) is corrected by the image alone: give it without masks or marks.")
-        return corrected(source, drawn.labels, drawn.names, files, tell)
-    began, image = time.perf_counter(), read_image(source)
+        if masks.paths:
+            raise InputError(
+                "A label map of this image (--labels) holds its bones and body. Give it without masks (--bone, "
+                "--tissue)."
+            )
+        before = None if strokes.marks is None else read_made(drawn.labels, drawn.names)
+        if before is None:
+            return corrected(source, drawn, strokes, files, tell)
+    began, image, changed = time.perf_counter(), read_image(source), list[str]()
     bone, body = (None if one is None else read_mask(one, image.grid) for one in (masks.bone, masks.tissue))
-    if drawn.paths:
-        made = _from_another(image, bone, body, strokes, drawn, tell)
+    marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
+    if before is not None:
+        again = correct_labels(image, before.labels, marks, before.probability, tell)
+        assert again.probability is not None
+        made = TissueLabels(again.labels, again.probability, (*before.notes, *again.notes))
+        title, changed = "Label map corrected by strokes", [f"{changed_told(again)}."]
+    elif drawn.paths:
+        made, title = _from_another(image, bone, body, marks, drawn, tell), "Label map made from another subject"
     else:
-        marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
-        made = label_tissues(image, bone, body, marks, tell)
+        made, title = label_tissues(image, bone, body, marks, tell), "Label map made from the image"
     names = tuple(made.labels.names.values())
     inputs = {"load0": source, **{role: of[0] for role, of in (masks.files | strokes.files | drawn.files).items()}}
     found = {"uncertain": made.uncertain, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
@@ -91,15 +103,14 @@ def label(
     volumes = volumes_ml(made.labels)
     uncertain = f"{100 * made.uncertain:.0f} % of the voxels have an uncertain label (probability below 90 %)"
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
-    lines = (told, f"{uncertain}; {files.picture} shows where.", *made.notes, f"Label map: {files.labels}")
-    made_from = f"Label map made from {'another subject' if drawn.paths else 'the image'}"
+    lines = (*changed, told, f"{uncertain}; {files.picture} shows where.", *made.notes, f"Label map: {files.labels}")
     table = Table("Volumes", ("tissue", "volume, mL"), tuple(volumes.items()))
-    section = Section(made_from, None, (table,), (picture,), (f"{uncertain}.", *made.notes), pictures_first=True)
+    section = Section(title, None, (table,), (picture,), (f"{uncertain}.", *made.notes), pictures_first=True)
     return Labelled(files.labels, lines, headline=f"{', '.join(volumes)}; {uncertain}", section=section)
 
 
 def _from_another(
-    image: Image, bone: Mask | None, body: Mask | None, strokes: Marks, drawn: GivenLabels,
+    image: Image, bone: Mask | None, body: Mask | None, marks: LabelMap | None, drawn: GivenLabels,
     tell: Callable[[float], None],
 ) -> TissueLabels:  # fmt: skip
     """Labels of another subject, transferred to the image."""
@@ -112,25 +123,7 @@ def _from_another(
         raise InputError(
             "`from_image` needs the label map of that image, `labels` (--from and --labels on the command line)."
         )
-    if strokes.paths:
-        raise InputError(
-            "Give marks or another subject's labels, not both. If the labels are wrong somewhere, correct them by hand."
-        )
     assert drawn.from_image is not None
     other, theirs = read_image(drawn.from_image), read_labels(drawn.labels, drawn.names)
     refuse_one_image_twice([("The image to label", image), ("the other subject's", other)])
-    return labels_from(image, other, theirs, bone, body, tell)
-
-
-def read_marks(path: Path, names: Path | None) -> LabelMap:
-    """Marks with the names of a table, of the file itself, or the usual ones of their numbers."""
-    marks = read_labels(path, names)
-    if names is None and all(name == f"label-{number}" for number, name in marks.names.items()):
-        if unknown := [number for number in marks.names if number not in MARKED]:
-            usual = ", ".join(f"{number} {name}" for number, name in MARKED.items())
-            raise InputError(
-                f"{path}: the marks {few(unknown)} have no name. Give a table of names as mark_names (--mark-names), "
-                f"or use the usual numbers: {usual}."
-            )
-        return replace(marks, names={number: MARKED[number] for number in marks.names})
-    return marks
+    return labels_from(image, other, theirs, bone, body, marks, tell)

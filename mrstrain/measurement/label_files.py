@@ -2,20 +2,24 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from dvc import LabelMap
+from dvc import LabelMap, TissueLabels, read_labels
 from dvc.arrays import FloatArray
-from dvc.errors import InputError, OutputError
+from dvc.errors import InputError, OutputError, few
+from dvc.io.images.read import read_header
+from dvc.io.result_folder import same_grid
 from dvc.measurement.subject import is_bones_name
+from dvc.own_files import read_json
 from dvc.report.drawing import ENDINGS
 from dvc.report.page import Section
 from dvc.report.sheet import View
-from mrstrain.records.inputs import alone, image_stem, output_folder
+from mrstrain.records.inputs import alone, image_stem, made_from_image, output_folder
 from mrstrain.records.outcome import Outcome
 
 _WRITTEN = (".nii.gz", ".nii", ".nrrd", ".mha")
@@ -79,6 +83,34 @@ class LabelFiles:
         """Make the folder; OutputError where another run writes the same label map."""
         with output_folder(self.labels.parent), alone(self.labels, self.labels.with_name(f".{self.labels.name}.lock")):
             yield
+
+
+def read_made(labels: Path, names: Path | None) -> TissueLabels | None:
+    """A label map that `label` made from an image, with its probabilities; None for any other, or one changed since.
+
+    InputError if the file with the probabilities, which lies beside it, cannot be read.
+    """
+    made = made_from_image(labels)
+    if made is None:
+        return None
+    files, given = LabelFiles.of(labels, ()), read_labels(labels, names)
+    try:
+        tissues = [str(name) for name in read_json(files.beside("_probability.json"))["components"]]
+        stored = read_header(files.probability, vectors=True, components=len(tissues))
+        same_grid(files.probability, stored.grid, given.grid)
+        probability = np.moveaxis(stored.load(), -1, 0)
+    except (OSError, ValueError, LookupError, TypeError) as lacking:
+        raise InputError(
+            f"{files.probability}: the probabilities that belong to {labels.name} cannot be read. Put them beside it, "
+            "or make the label map again (mrstrain label)."
+        ) from lacking
+    numbers = {name: number for number, name in given.names.items()}
+    if not set(numbers) <= set(tissues):
+        named = f"has the tissues {few(tissues)}, not {few(numbers)}"
+        raise InputError(f"{labels}: it {named}. Give the table of names written with it as names (--names).")
+    unused = count(max(given.names) + 1)  # for tissues without a voxel
+    listed = {numbers[name] if name in numbers else next(unused): name for name in tissues}
+    return TissueLabels(replace(given, names=listed), probability, made.notes)
 
 
 def volumes_ml(labels: LabelMap) -> Mapping[str, float]:

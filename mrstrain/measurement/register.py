@@ -23,6 +23,7 @@ from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
 from mrstrain.measurement.acquisition import scans_record
 from mrstrain.measurement.answer import measured_strain
+from mrstrain.measurement.auto_labels import check_auto, labelled, next_step
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.plan import Plan, record_of
@@ -30,7 +31,7 @@ from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import (
     AUTO,
-    MADE_LABELS,
+    MarksForAuto,
     MeshAndAxes,
     RegistrationOptions,
     Running,
@@ -42,7 +43,6 @@ from mrstrain.records.durations import LABELS, REPORT, WRITING, registrations
 from mrstrain.records.inputs import (
     alone,
     case_names,
-    made_labels,
     output_folder,
     read_subject,
     refuse_small_disk,
@@ -60,7 +60,7 @@ _BYTES_PER_VOXEL = 35  # of one image's results: 27 as measured, 5 with the plat
 @door
 def register(
     load0: Path | str, loads: Sequence[Path | str], *, out: Path | str, subject_files: SubjectFiles,
-    registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
+    strokes: MarksForAuto, registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
     progress: OnProgress | None = None, worker: Worker | None = None,
 ) -> Series:  # fmt: skip
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
@@ -73,7 +73,7 @@ def register(
         Unloaded image (reference configuration).
     loads : paths
         Loaded images. Each gets a folder in ``out`` named after its file.
-    subject_files
+    subject_files, strokes
         With labels "auto", `label` makes the label map first, in the folder ``labels`` of ``out``.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
@@ -90,11 +90,16 @@ def register(
     cases, paths = list(places), list(places.values())
     chosen = engine_of(registration, labelled=subject_files.labels is not None)
     _check_start(scans, chosen)
-    given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
+    given = [p for of in (subject_files, strokes, registration, scans, onto) for p in of.paths]
     refuse_touching_inputs(target, cases, [load0, *paths, *given])
     align, tell = registration.align, progress or (lambda *_: None)
     if subject_files.labels == AUTO:
-        _check_auto(subject_files, cases, scans)
+        check_auto(subject_files, strokes, cases, scans)
+    elif strokes.paths:
+        raise InputError(
+            "`marks` and `mark_names` are for labels auto (--marks, --mark-names, --labels auto on the command line). "
+            "To correct a label map with strokes, use `mrstrain label --labels ... --marks ...`."
+        )
     elif align == "bone" and subject_files.bone is None and subject_files.bone_label is None:
         if subject_files.labels is not None:
             raise InputError(
@@ -122,7 +127,8 @@ def register(
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
         if to_label:
             _hold(target, stack)
-            subject_files, of_labels = _labelled(load0, subject_files, target, partial(tell, LABELS, "tissues"))
+            making = partial(tell, LABELS, "tissues")
+            subject_files, of_labels = labelled(load0, subject_files, strokes, target, making)
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         subject = replace(subject, tissue=subject.body())
         # Its rigid motion is found by aligning.
@@ -135,7 +141,7 @@ def register(
         refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
         settings = Settings(chosen, align, running.seed, threads)
         model = model or error_model_of(chosen.name)
-        files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}}
+        files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}, **strokes.files}
         more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
         more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
         more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}
@@ -151,7 +157,8 @@ def register(
     tell(REPORT, WRITING, 0.0)
     shown = [case for case in finished if case.name != REPEAT]
     answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
-    series = Series.of(target, finished, run.failures, record, answer, of_labels)
+    advice = next_step(subject_files, cases, scans, registration, chosen)
+    series = Series.of(target, finished, run.failures, record, answer, of_labels, advice=advice)
     tell(REPORT, WRITING, 1.0)
     return series
 
@@ -160,37 +167,6 @@ def _hold(out: Path, stack: ExitStack) -> None:
     """Make the output folder, and refuse it to other runs until the stack is closed."""
     stack.enter_context(output_folder(out))
     stack.enter_context(alone(out))
-
-
-def _check_auto(files: SubjectFiles, cases: Sequence[str], scans: Scans) -> None:
-    """InputError if the label map cannot be made from the image."""
-    if files.bone is None:
-        raise InputError("labels auto also needs the mask of the bone: `bone` (--bone on the command line).")
-    if files.names is not None or files.bone_label is not None:
-        raise InputError(
-            "`names` and `bone_label` need a label map of your own; they cannot be used with labels auto (on the "
-            "command line: --names, --bone-label, --labels auto)."
-        )
-    if scans.allow_missing:
-        raise InputError(
-            "labels auto cannot be combined with `allow_missing` (--allow-missing on the command line): the image must "
-            "not have missing voxels."
-        )
-    folder = Path(MADE_LABELS).parts[0]
-    if folder in map(one_spelling, cases):
-        raise InputError(f"A loaded image is named '{folder}', as the folder of the label map; rename it.")
-
-
-def _labelled(
-    load0: Path, files: SubjectFiles, out: Path, tell: Callable[[float], None]
-) -> tuple[SubjectFiles, tuple[Section, ...]]:
-    """Make the label map; the files with it, and its section of the report."""
-    from mrstrain.measurement.label import label  # with it come skimage.restoration and scipy.stats: 0.7 s
-
-    labels, names = made_labels(out)
-    tell(0.0)
-    made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, watch=tell)
-    return files.model_copy(update={"labels": labels, "names": names}), (made.section,)
 
 
 class InSeries(Running):

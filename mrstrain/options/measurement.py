@@ -67,25 +67,35 @@ class Marks(Options):
     marks: Annotated[
         Path | None,
         Cli(
-            help="Strokes: a label map with a few voxels painted in each tissue, on the page written by --draw, in "
-            "ITK-SNAP, 3D Slicer (.seg.nrrd) or any other program."
+            help="Strokes: a label map with a few voxels painted in a tissue, on the page written by --draw, in "
+            "ITK-SNAP, 3D Slicer (.seg.nrrd) or any other program. Where a stroke contradicts the labels, these are "
+            "corrected within 8 mm."
         ),
     ] = None
-    """Strokes: a label map with a few voxels painted in each tissue, on the page written by draw_strokes, in ITK-SNAP,
-    3D Slicer (.seg.nrrd) or any other program."""
+    """Strokes: a label map with a few voxels painted in a tissue, on the page written by draw_strokes, in ITK-SNAP, 3D
+    Slicer (.seg.nrrd) or any other program. Where a stroke contradicts the labels, these are corrected within 8 mm."""
     mark_names: Path | None = None
     """Table of the names of the strokes: ITK-SNAP, Slicer or CSV. Default: 1 bone, 2 fat, 3 muscle, 4 skin, 5 tendon, 6
     other."""
 
 
+class MarksForAuto(Marks):
+    """A few strokes on the unloaded image, from which its label map is made."""
+
+    marks: Path | None = None
+    """With --labels auto: strokes in a few tissues, as in `mrstrain label`. With a stroke in the bone, --bone is not
+    needed."""
+
+
 class GivenLabels(Options):
-    """A drawn label map: of this image, to be corrected, or of another subject's, to be transferred."""
+    """A label map: of this image, to be corrected, or of another subject's, to be transferred."""
 
     panel: ClassVar[str] = "Inputs"
 
     labels: Path | None = None
-    """Label map of this image, to be corrected: the boundaries of its bones and skin move by up to 2.5 voxels to where
-    the image shows them. With --from: label map of that other image, to be transferred."""
+    """Label map of this image, to be corrected: with --marks, within 8 mm of the strokes that contradict it; without,
+    the boundaries of its bones and skin move by up to 2.5 voxels to where the image shows them. With --from: label map
+    of that other image, to be transferred."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
     from_image: Annotated[Path | None, Cli(name="--from")] = None
@@ -101,7 +111,7 @@ class SubjectFiles(BoneAndBody):
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
-    """Label map of the tissues on the unloaded image, or auto to make it from the image and --bone."""
+    """Label map of the tissues on the unloaded image, or auto to make it from the image and --bone or --marks."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
 

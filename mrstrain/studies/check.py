@@ -216,7 +216,7 @@ class _Look:
 
     def at_marks(self, reference: Image | None) -> None:
         """Check the marks for the label map, among which the bone must be if there is no mask of it."""
-        from mrstrain.measurement.label import read_marks  # it draws, and matplotlib takes half a second
+        from mrstrain.measurement.strokes import read_marks  # it draws, and matplotlib takes half a second
 
         images = self.study.images.located(self.study.place)
         marks = None if images.marks is None else self.tried(read_marks, images.marks, images.mark_names)

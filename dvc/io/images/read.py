@@ -21,7 +21,7 @@ _SMALLEST_MM, _LARGEST_MM = 1.0, 3000.0  # along the longest edge of an image
 _MOST_UNLIKE = 100.0  # longest over shortest edge of a voxel
 _MIN_SLICES = 4
 
-_FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool], StoredVolume]]] = {
+_FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool, int], StoredVolume]]] = {
     ".nii": ("NIfTI", read_nifti_header), ".nii.gz": ("NIfTI", read_nifti_header),
     ".nrrd": ("NRRD", read_nrrd_header), ".nhdr": ("NRRD", read_nrrd_header),
     ".mha": ("MetaImage", read_meta_header), ".mhd": ("MetaImage", read_meta_header),
@@ -127,14 +127,14 @@ def _refuse_size_of_no_body(place: Path, grid: Grid, unit: str) -> None:
 
 
 def read_header(
-    path: Path, *, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+    path: Path, *, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False, components: int = 3
 ) -> StoredVolume:
-    """Read what a file holds, its voxels not yet read: scalars, or with `vectors` three components per voxel."""
+    """Read what a file holds, its voxels not yet read: scalars, or with `vectors` so many `components` per voxel."""
     suffix = _known_suffix(path.name)
     if suffix is None:
         known = f"{', '.join(_FORMATS)}, enhanced DICOM files and folders of DICOM files"
         raise ImageFileError(f"{path}: this image format is not supported. Supported: {known}.")
-    return _FORMATS[suffix][1](path, volume, max_bytes, vectors)
+    return _FORMATS[suffix][1](path, volume, max_bytes, vectors, components)
 
 
 def format_of(name: str) -> str:

@@ -70,8 +70,10 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     return fields, pairs, end.end() if end else len(start)
 
 
-def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bool) -> StoredVolume:
-    """What an NRRD file holds: scalars, or with `vectors` three components per voxel."""
+def read_nrrd_header(
+    path: Path, volume: int | None, max_bytes: int, vectors: bool, components: int = 3
+) -> StoredVolume:
+    """What an NRRD file holds: scalars, or with `vectors` so many `components` per voxel."""
     fields, _, end = nrrd_fields(path)
     sizes = _whole_numbers(path, fields, "sizes")
     if _whole_numbers(path, fields, "dimension") != [len(sizes)]:
@@ -89,7 +91,8 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     others = [axis for axis, step in enumerate(steps) if step is None]
     if len(axes) != 3 or len(others) > 1:
         raise ImageFileError(f"{path}: a {len(axes)}D image of sizes {sizes}; a 3D scalar image is needed.")
-    select, components = _fourth_axis(path, fields, sizes, others[0] if others else None, volume, vectors)
+    other = others[0] if others else None
+    select, along = _fourth_axis(path, fields, sizes, other, volume, components if vectors else None)
     refuse_if_too_large(path, tuple(sizes), max_bytes)
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
@@ -120,19 +123,20 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     grid = grid_of_axes(path, [sizes[axis] for axis in axes], columns, origin)
     dtype = np.dtype((">" if order == "big" else "<") + _NRRD_TYPES[kind])
     packed = encoding != "raw"
-    return StoredVolume(data, grid, dtype, tuple(sizes), unit, start, packed, select=select, components=components)
+    return StoredVolume(data, grid, dtype, tuple(sizes), unit, start, packed, select=select, components=along)
 
 
 def _fourth_axis(
-    path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None, volume: int | None, vectors: bool
-) -> tuple[tuple[int, int] | None, int | None]:
-    """What is kept of a fourth axis: a volume (axis, index), or a vector's three components (axis)."""
+    path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None, volume: int | None,
+    components: int | None,
+) -> tuple[tuple[int, int] | None, int | None]:  # fmt: skip
+    """What is kept of a fourth axis: a volume (axis, index), or a vector's ``components`` (axis)."""
     kinds = fields.get("kinds", "").split()
     kind = kinds[other].lower() if other is not None and len(kinds) == len(sizes) else ""
     count = 1 if other is None else sizes[other]
-    if vectors:
-        if count != 3:
-            raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
+    if components is not None:
+        if count != components:
+            raise ImageFileError(f"{path}: {count} components per voxel; {_vectors_of(components)} are needed.")
         if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
             raise ImageFileError(f"{path}: the three values per voxel are of kind {kind}; vectors are needed.")
         return None, other
@@ -145,6 +149,10 @@ def _fourth_axis(
         raise ImageFileError(f"{path}: each voxel holds {count} values (kind {kind}); a scalar image is needed.")
     index = pick_volume(path, count, volume)
     return None if other is None else (other, index), None
+
+
+def _vectors_of(components: int) -> str:
+    return f"vectors of {'three' if components == 3 else components}"
 
 
 def _steps(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
@@ -173,20 +181,22 @@ def _vector(path: Path, written: str, field: str) -> FloatArray:
     raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
 
 
-def read_meta_header(path: Path, volume: int | None, max_bytes: int, vectors: bool) -> StoredVolume:
-    """What a MetaImage file holds: scalars, or with `vectors` three components per voxel."""
+def read_meta_header(
+    path: Path, volume: int | None, max_bytes: int, vectors: bool, components: int = 3
+) -> StoredVolume:
+    """What a MetaImage file holds: scalars, or with `vectors` so many `components` per voxel."""
     fields, end = _meta_fields(path)
     sizes = _whole_numbers(path, fields, "dimsize")
     if len(sizes) != 3 or fields.get("ndims") != "3":
         raise ImageFileError(
             f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed. Give all slices in one file."
         )
-    layout = (3, *sizes) if vectors else tuple(sizes)
+    layout = (components, *sizes) if vectors else tuple(sizes)
     refuse_if_too_large(path, layout, max_bytes)
     pick_volume(path, 1, volume)
     channels = fields.get("elementnumberofchannels", "1")
-    if vectors and channels != "3":
-        raise ImageFileError(f"{path}: {channels} components per voxel; vectors of three are needed.")
+    if vectors and channels != str(components):
+        raise ImageFileError(f"{path}: {channels} components per voxel; {_vectors_of(components)} are needed.")
     if not vectors and channels != "1":
         raise ImageFileError(f"{path}: each voxel holds {channels} values; a scalar image is needed.")
     kind = fields.get("elementtype", "")

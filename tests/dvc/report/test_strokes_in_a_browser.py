@@ -16,7 +16,7 @@ from dvc.report.sheet import AXES, PLANES, Plane, View
 from dvc.report.strokes import write_strokes_page
 from mrstrain import draw_strokes
 from mrstrain.cli.app import app
-from mrstrain.measurement.label import read_marks
+from mrstrain.measurement.strokes import read_marks
 from phantoms import Heel, heel_grid, labels_of, scan
 from tests.browser import CHROMIUM, Tab, browser
 from tests.dvc.report.test_page_in_a_browser import ATTACK

@@ -8,16 +8,28 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 from typer.testing import CliRunner
 
 import mrstrain
-from dvc import Image, LabelMap, read_image, read_labels, read_mask, write_image, write_labels, write_mask
+from dvc import (
+    Image,
+    LabelMap,
+    TissueLabels,
+    read_image,
+    read_labels,
+    read_mask,
+    write_image,
+    write_labels,
+    write_mask,
+)
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_names
 from dvc.measurement.subject import LabelsFromImage
 from mrstrain.cli.app import app
 from mrstrain.comparison.methods import _labels
-from mrstrain.measurement.label import read_marks
+from mrstrain.measurement import label as labelling
+from mrstrain.measurement.strokes import read_marks
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import made_from_image, read_subject
 from phantoms import Heel, heel_grid, labels_of, misdrawn, scan
@@ -144,7 +156,7 @@ def test_a_drawn_label_map_is_corrected_and_its_files_agree(folder: Path, tmp_pa
 
 def test_what_is_corrected_needs_no_mask_and_names_need_labels(folder: Path, tmp_path: Path) -> None:
     load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "t.nii.gz"
-    with pytest.raises(InputError, match="give it without masks or marks"):
+    with pytest.raises(InputError, match="Give it without masks"):
         mrstrain.label(load0, labels=bone, bone=bone, out=out)
     with pytest.raises(InputError, match="`names` is for the label map `labels`, which is not given"):
         mrstrain.label(load0, bone=bone, names=tmp_path / "names.csv", out=out)
@@ -179,13 +191,114 @@ def test_what_cannot_be_carried_over_is_refused(folder: Path, tmp_path: Path) ->
     load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "t.nii.gz"
     with pytest.raises(InputError, match="`from_image` needs the label map of that image, `labels`"):
         mrstrain.label(load0, from_image=load0, out=out)
-    with pytest.raises(InputError, match="not both"):
-        mrstrain.label(load0, from_image=load0, labels=bone, marks=bone, out=out)
     with pytest.raises(InputError, match="are the same image"):
         mrstrain.label(load0, from_image=load0, labels=bone, out=out)
     with pytest.raises(OutputError, match="would be overwritten"):
         mrstrain.label(load0, from_image=load0, labels=bone, out=bone)
     assert not list(tmp_path.iterdir())
+
+
+def strokes(folder: Path, place: Path, names: tuple[str, str] = ("fat", "muscle")) -> LabelMap:
+    """Strokes as 3D Slicer saves them, on the part of the grid where they lie: fat is marked where it is muscle."""
+    grid = read_image(folder / "Load0.nii.gz").grid
+    deep = distance_transform_edt(labels_of(Heel(41), grid).region("muscle").inside)
+    first = [int(n) for n in np.unravel_index(np.argmax(deep), grid.shape)]
+    first[1] -= 1
+    values = np.full((1, 3, 2), 7, dtype=np.uint8)
+    values[:, :, 1] = 0
+    directions = " ".join(f"({','.join(map(repr, step.tolist()))})" for step in grid.affine[:3, :3].T)
+    header = [
+        "NRRD0004", "type: unsigned char", "dimension: 3", "space: left-posterior-superior", "sizes: 1 3 2",
+        f"space directions: {directions}", "kinds: domain domain domain", "encoding: raw",
+        f"space origin: ({','.join(map(repr, grid.points_at(np.array([first], dtype=float))[0].tolist()))})",
+        "Segment0_ID:=Segment_1", "Segment0_LabelValue:=7", f"Segment0_Name:={names[0]}",
+        "Segment1_LabelValue:=8", f"Segment1_Name:={names[1]}",
+    ]  # fmt: skip
+    place.write_bytes(("\n".join(header) + "\n\n").encode() + values.tobytes(order="F"))
+    where = np.zeros(grid.shape, dtype=np.int64)
+    where[first[0], first[1] : first[1] + 3, first[2]] = 7
+    return LabelMap(grid, where, {7: names[0]})
+
+
+def test_strokes_of_slicer_correct_a_made_map_near_them_and_its_probabilities(folder: Path, tmp_path: Path) -> None:
+    made, out, drawn = folder / "made", tmp_path / "tissues.nii.gz", tmp_path / "strokes.seg.nrrd"
+    marked = strokes(folder, drawn)
+    given = {"labels": made / "tissues.nii.gz", "names": made / "tissues.csv", "marks": drawn}
+    told = mrstrain.label(folder / "Load0.nii.gz", **given, out=out)
+    before, after = (read_labels(one / "tissues.nii.gz", one / "tissues.csv") for one in (made, tmp_path))
+    assert after.names == before.names
+    far = distance_transform_edt(marked.labels == 0, sampling=marked.grid.spacing_mm) > 8.0
+    changed = after.labels != before.labels
+    assert (after.region("fat").inside & changed)[marked.labels > 0].all()
+    assert not changed[far].any()
+    was, now = (
+        nibabel.load(one / "tissues_probability.nii.gz").get_fdata()[..., 0, :] for one in (made, tmp_path)
+    )  # fmt: skip
+    assert np.array_equal(now[far], was[far])
+    assert now[marked.labels > 0, 1] == pytest.approx(1.0, abs=1e-6)
+    record = json.loads((tmp_path / "tissues.json").read_text())
+    assert set(record["inputs"]) == {"load0", "labels", "names", "marks"}
+    assert made_from_image(out) == LabelsFromImage(record["uncertain"], tuple(record["notes"]))
+    assert told.section.title == "Label map corrected by strokes"
+    assert told.summary()[0] == f"{100 * np.mean(changed[before.labels > 0]):.1f} % of the voxels have another label."
+    assert (tmp_path / "tissues.png").is_file()
+    again = tmp_path / "again.nii.gz"  # what was corrected can be corrected
+    mrstrain.label(folder / "Load0.nii.gz", labels=out, names=tmp_path / "tissues.csv", marks=drawn, out=again)
+    assert np.array_equal(read_labels(again).labels, after.labels)
+
+
+def test_strokes_correct_a_drawn_map_which_stays_the_users(folder: Path, tmp_path: Path) -> None:
+    load0, drawn, out = folder / "Load0.nii.gz", tmp_path / "drawn.nrrd", tmp_path / "out.nrrd"
+    truth = labels_of(Heel(41), read_image(load0).grid)
+    write_labels(drawn, truth)
+    marked = strokes(folder, tmp_path / "strokes.seg.nrrd", ("vessel", "muscle"))
+    given = {"names": tmp_path / "drawn.csv", "marks": tmp_path / "strokes.seg.nrrd"}
+    told = mrstrain.label(load0, labels=drawn, **given, out=out).summary()
+    made = read_labels(out, tmp_path / "out.csv")
+    assert set(made.names.values()) == {*truth.names.values(), "vessel"}
+    assert made.region("vessel").inside[marked.labels > 0].all()
+    changed = made.labels != truth.labels
+    assert set(np.unique(truth.labels[changed])) == {n for n, name in truth.names.items() if name == "muscle"}
+    assert not changed[distance_transform_edt(marked.labels == 0, sampling=marked.grid.spacing_mm) > 8.0].any()
+    assert told[1].startswith("Volumes, mL: ")
+    assert "vessel" in told[1]
+    assert made_from_image(out) is None
+    assert not list(tmp_path.glob("out_probability*"))
+
+
+def test_strokes_that_cannot_correct_a_map_are_refused(folder: Path, tmp_path: Path) -> None:
+    made, drawn, out = folder / "made", tmp_path / "strokes.seg.nrrd", tmp_path / "out.nii.gz"
+    load0, labels, names = folder / "Load0.nii.gz", made / "tissues.nii.gz", made / "tissues.csv"
+    strokes(folder, drawn)
+    with pytest.raises(InputError, match=r"not label-1, label-2, .* Give the table of names"):
+        mrstrain.label(load0, labels=labels, marks=drawn, out=out)
+    alone = shutil.copytree(made, tmp_path / "alone")
+    (alone / "tissues_probability.nii.gz").unlink()
+    with pytest.raises(InputError, match=r"tissues_probability\.nii\.gz: .* cannot be read\. Put them beside it"):
+        mrstrain.label(load0, labels=alone / "tissues.nii.gz", names=names, marks=drawn, out=out)
+    (alone / "tissues.json").unlink()  # then it is a map like any other
+    with pytest.raises(InputError, match="The labels have no names, so that strokes of fat cannot be assigned"):
+        mrstrain.label(load0, labels=alone / "tissues.nii.gz", marks=drawn, out=out)
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_strokes_go_along_with_another_subjects_labels(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(*given: object) -> TissueLabels:
+        assert given[5].names == {7: "fat"}
+        raise InputError("as asked")
+
+    monkeypatch.setattr(labelling, "labels_from", asked)
+    other = tmp_path / "other.nii.gz"
+    write_image(other, scan(Heel(7), heel_grid(2.4), snr=25.0, number=0))
+    strokes(folder, tmp_path / "strokes.seg.nrrd")
+    given = {"labels": folder / "made" / "tissues.nii.gz", "names": folder / "made" / "tissues.csv"}
+    with pytest.raises(InputError, match="as asked"):
+        mrstrain.label(
+            folder / "Load0.nii.gz", from_image=other, marks=tmp_path / "strokes.seg.nrrd", **given,
+            out=tmp_path / "out.nii.gz",
+        )  # fmt: skip
 
 
 def test_a_page_to_draw_on_is_written_alone(folder: Path, tmp_path: Path) -> None:

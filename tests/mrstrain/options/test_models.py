@@ -25,6 +25,7 @@ from mrstrain.options.measurement import (
     ExistingFiles,
     GivenLabels,
     Marks,
+    MarksForAuto,
     MeshAndAxes,
     RecordedEngine,
     RecordedFiles,
@@ -60,7 +61,7 @@ from validate.location import LEAST_ML
 
 COMMANDS: dict[str, tuple[type[Options], ...]] = {
     "label": (BoneAndBody, Marks, GivenLabels),
-    "register": (SubjectFiles, RegistrationOptions, Scans, MeshAndAxes, Running),
+    "register": (SubjectFiles, MarksForAuto, RegistrationOptions, Scans, MeshAndAxes, Running),
     "strain": (ExistingFiles, MeshAndAxes),
     "phantom": (HeelShape,),
     "twin": (ExistingFiles,),
@@ -87,6 +88,7 @@ TABLES: dict[type[Options], tuple[str, str]] = {  # table of the study file, and
 NOT_IN_A_STUDY = {  # what a study has in its own way
     Scans: "repeat and allow_missing are keys of [images]; a start and landmarks belong to a single load",
     Marks: "marks are keys of [images]",
+    MarksForAuto: "marks are keys of [images]",
     GivenLabels: "a label map is corrected or transferred before a study",
     BoneAndBody: "part of SubjectFiles",
     ExistingFiles: "those of [images], as SubjectFiles",

@@ -15,10 +15,10 @@ import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
 from dvc import atomic_files as whole
-from dvc.errors import InputError, OutputError
+from dvc.errors import ImageFileError, InputError, OutputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io.images.labels import read_labels, read_mask
-from dvc.io.images.read import read_image
+from dvc.io.images.read import read_header, read_image
 from dvc.io.images.write import refuse_overwriting_inputs, write_image, write_labels, write_mask, write_vectors
 
 _SUFFIXES = ["nii", "nii.gz", "nrrd", "mha"]
@@ -87,6 +87,18 @@ class TestRoundTrip:
         theirs = sitk.GetArrayFromImage(other).transpose(2, 1, 0, 3)
         np.testing.assert_array_equal(theirs, _as_itk_reads(values, suffix))
         np.testing.assert_allclose(other.GetOrigin(), grid.origin_mm, rtol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", _SUFFIXES)
+@pytest.mark.parametrize("count", [2, 5])
+def test_any_number_of_components_comes_back(tmp_path: Path, suffix: str, count: int) -> None:
+    values, path = _tensors(count), tmp_path / f"a.{suffix}"
+    write_vectors(path, _grid(), values, [f"tissue {n}" for n in range(count)], "probability", "invariant", unit="1")
+    stored = read_header(path, vectors=True, components=count)
+    np.testing.assert_array_equal(stored.load(), values)
+    assert stored.grid.same_as(_grid())
+    with pytest.raises(ImageFileError, match=r"vectors of 4 are needed|a displacement image has"):
+        read_header(path, vectors=True, components=4)
 
 
 @pytest.mark.parametrize("suffix", _SUFFIXES)
