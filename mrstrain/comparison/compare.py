@@ -215,7 +215,7 @@ def _read(
             return measurement.deformation(), pickle.load(file)
     results, part = [file.read(grid) for file in files], kept.with_name(f"{kept.name}.part")
     with suppress(OSError):  # a disk without room: they are read again
-        with part.open("wb") as file:
-            pickle.dump(results, file, protocol=pickle.HIGHEST_PROTOCOL)
+        with part.open("wb") as written:
+            pickle.dump(results, written, protocol=pickle.HIGHEST_PROTOCOL)
         part.replace(kept)
     return measurement.deformation(), results
