@@ -98,9 +98,7 @@ def correct_labels(
         raise InputError("The labels are on another grid than the image; resample them with `fit_mask`.")
     if marks is not None:
         before = TissueLabels(labels, certain(labels) if probability is None else probability)
-        after = corrected_near(image, before, marks)
-        watch(1.0)
-        return CorrectedLabels(after.labels, _changed(labels, after.labels), {}, after.notes, after.probability)
+        return _by_marks(image, before, marks, watch)
     if probability is not None:
         raise InputError("The probability of each tissue (probability) can be corrected by marks only: give both.")
     bones, skin = correctable(labels)
@@ -132,13 +130,23 @@ def correct_labels(
     corrected = np.where(new_bones, _nearest(given, bones), np.where(new_skin, _nearest(given, skin), 0))
     corrected = np.where(body & ~new_bones & ~new_skin, _nearest(given, others), corrected)
     moved = {
-        name: _moved(before, after, spacing)
-        for name, before, after in (("bone", bones, new_bones), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
-        if (before & body).any()
+        name: _moved(was, now, spacing)
+        for name, was, now in (("bone", bones, new_bones), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
+        if (was & body).any()
     }
     watch(1.0)
-    made = LabelMap(grid, corrected, labels.names)
-    return CorrectedLabels(made, _changed(labels, made), moved, tuple(notes))
+    result = LabelMap(grid, corrected, labels.names)
+    return CorrectedLabels(result, _changed(labels, result), moved, tuple(notes))
+
+
+def _by_marks(
+    image: Image, given: TissueLabels, marks: LabelMap, watch: Callable[[float], None]
+) -> CorrectedLabels:  # fmt: skip
+    """The labels as they are after they were corrected near marks."""
+    watch(0.1)
+    made = corrected_near(image, given, marks)
+    watch(1.0)
+    return CorrectedLabels(made.labels, _changed(given.labels, made.labels), {}, made.notes, made.probability)
 
 
 def correctable(labels: LabelMap) -> tuple[BoolArray, BoolArray]:

@@ -107,3 +107,15 @@ def test_a_correction_follows_the_image_and_stays_near_its_mark(spacing_mm: tupl
     assert (away_mm[found[1] != wrong[1]]).max() > 7.0
     same = corrected(values.astype(np.float32), wrong, where, {0: (i < 26) & mark}, grid)
     assert np.array_equal(same, wrong)  # marks that agree change nothing
+
+
+def test_a_tissue_that_no_mark_is_about_stays_where_the_image_shows_no_edge() -> None:
+    i = np.broadcast_to(np.arange(40)[:, None, None], GRID.shape)
+    values = np.random.default_rng(8).normal(400.0, 20.0, GRID.shape).astype(np.float32)
+    given = np.stack([i < 20, (i >= 20) & (i < 26), i >= 26]).astype(np.float32)
+    mark = np.zeros(GRID.shape, dtype=bool)
+    mark[22:24, 18:22, 18:22] = True
+    found = corrected(values, given, np.ones(GRID.shape, dtype=bool), {0: mark}, GRID)
+    assert found[0][mark].min() == 1.0
+    assert (found.argmax(axis=0) != given.argmax(axis=0)).sum() > 2 * mark.sum()
+    assert np.array_equal(found[2], given[2])
