@@ -4,6 +4,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from dvc import correct_labels, fit_mask, read_image, read_labels, write_labels
 from dvc.atomic_files import write_json
 from dvc.labelling.boundaries import CorrectedLabels
@@ -14,6 +16,8 @@ from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volu
 from mrstrain.measurement.strokes import read_marks
 from mrstrain.options.measurement import GivenLabels, Marks
 from mrstrain.records.provenance import provenance
+
+_LEAST_SHARE = 0.001  # told as one: the number of voxels says more where a stroke corrects a few
 
 
 def corrected(
@@ -45,7 +49,9 @@ def corrected(
 
 def changed_told(made: CorrectedLabels) -> str:
     """How much of a label map was changed, in a line."""
-    return f"{100 * made.changed:.1f} % of the voxels have another label"
+    voxels = round(made.changed * np.count_nonzero(made.labels.labels))
+    some = f"{100 * made.changed:.1f} % of the" if made.changed >= _LEAST_SHARE else f"{voxels}"
+    return f"{some} voxels have another label"
 
 
 def _moved(made: CorrectedLabels) -> tuple[str, Table]:

@@ -240,7 +240,8 @@ def test_strokes_of_slicer_correct_a_made_map_near_them_and_its_probabilities(fo
     assert set(record["inputs"]) == {"load0", "labels", "names", "marks"}
     assert made_from_image(out) == LabelsFromImage(record["uncertain"], tuple(record["notes"]))
     assert told.section.title == "Label map corrected by strokes"
-    assert told.summary()[0] == f"{100 * np.mean(changed[before.labels > 0]):.1f} % of the voxels have another label."
+    assert np.mean(changed[before.labels > 0]) < 0.001
+    assert told.summary()[0] == f"{changed.sum()} voxels have another label."
     assert (tmp_path / "tissues.png").is_file()
     again = tmp_path / "again.nii.gz"  # what was corrected can be corrected
     mrstrain.label(folder / "Load0.nii.gz", labels=out, names=tmp_path / "tissues.csv", marks=drawn, out=again)
