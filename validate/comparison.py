@@ -364,6 +364,8 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
         if one.case.aligned_on == "none":
             what = "the rigid motion of the bone was not removed from this measurement, so displacements include it."
             notes.append(f"{load}: {what}")
+        if gaps := ", ".join(one.case.without_intervals):
+            notes.append(f"{load}: no intervals in {gaps}; the measurement gives the reason.")
         if error is not None and np.isnan(error.widening):
             what = "the error model is from one motion of one subject, so the coverage of its intervals is unknown."
             notes.append(f"{load}: {what}")

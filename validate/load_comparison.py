@@ -85,6 +85,8 @@ class LoadCase:
         What was aligned rigidly: "bone", "image" or "none"; empty if unknown.
     image : path or None
         The registered loaded image, shown in the viewer of the report.
+    without_intervals : tuple of str
+        Tissues for which the measurement has no intervals, although its error is known; nor has the comparison.
     """
 
     load: str
@@ -94,6 +96,7 @@ class LoadCase:
     verdict: Verdict | None = None
     aligned_on: str = ""
     image: Path | None = None
+    without_intervals: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -121,7 +124,8 @@ class LoadCase:
         known, axes = measured.error_bars.uncertainty, None if measured.source is None else measured.source.subject.axes
         error = known.table if error is None and known is not None else error
         on, read = str(measured.alignment.get("on", "")), partial(_given, measured.deformation, results)
-        case = cls(load, read, error=error, verdict=measured.verdict, aligned_on=on)
+        gaps = dict.fromkeys(i.region for i in measured.error_bars.intervals if np.isnan(i.low))
+        case = cls(load, read, error=error, verdict=measured.verdict, aligned_on=on, without_intervals=tuple(gaps))
         # Those of a subject begin with the direction from the body to the plate, these with that of its force.
         return case if axes is None else replace(case, axes=plate_axes(-axes[:, 0], axes[:, 1]))
 
@@ -234,7 +238,7 @@ def compare_load(
         skin=tuple(skin_displacement(fields, name, case.load, of, measured, normal) for name, of in models.items()),
         model_forms=tuple(_model_forms(fields, case.load)),
         bands=known,
-        decompositions={} if case.error is None else _decompositions(fields, case.error, np.array(truths), cells),
+        decompositions={} if case.error is None else _decompositions(fields, case, case.error, np.array(truths), cells),
         errors=tuple(comparison_errors(case.load, fields, known, uncertain, levels, by.strains)),
     )  # fmt: skip
 
@@ -272,11 +276,13 @@ def _model_forms(fields: MappedFields, load: str) -> Iterator[ModelForm]:
 
 
 def _decompositions(
-    fields: MappedFields, error: ErrorTable, truths: FloatArray, cells: location.CellGraph
+    fields: MappedFields, case: LoadCase, error: ErrorTable, truths: FloatArray, cells: location.CellGraph
 ) -> dict[str, Decomposition]:
     """Each tissue's fields in coefficients; ``truths`` (m, n) in the common cells."""
     made = {}
-    for tissue, where in list(fields.parts.items())[1:]:
+    for tissue, where in fields.parts.items():
+        if tissue in (ALL, *case.without_intervals):
+            continue
         measured, models = fields.measured.max_shear[where], {n: of[where] for n, of in _shears(fields).items()}
         bias, sd = error.expected(tissue.lower(), measured, fields.to_bone_mm[where].astype(np.float32))
         u_cal = float(np.sqrt(np.average(bias**2 + sd**2, weights=fields.volumes_ml[where])))
@@ -324,6 +330,6 @@ def _bands(
             yield truth
 
     models = {name: shear[common] for name, shear in _shears(fields).items()}
-    inside = {name: where[common] for name, where in fields.parts.items()}
+    inside = {name: where[common] for name, where in fields.parts.items() if name not in case.without_intervals}
     volumes = fields.volumes_ml[common]
     return bands(truths(), models, volumes, inside, error.factor_of, draws.narrowed, by.strains, uncertain)

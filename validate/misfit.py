@@ -149,9 +149,9 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
     moved = np.linalg.norm(result.deformation.u_mm[distance < _NEAR_BONE_MM], axis=1)
     if len(moved) and np.median(moved) > _FAR_MM:
         wrong.append(
-            f"the model moves by {np.median(moved):.0f} mm at the bone (limit: 'Do not trust' above {_FAR_MM:g} mm), "
-            "farther than a load moves it. Check the unit and frame of the displacements, and that they are in the "
-            "order of the nodes."
+            f"the model moves by {np.median(moved):.0f} mm at the bone, more than any load would cause ('Do not trust' "
+            f"above {_FAR_MM:g} mm). Check the unit and frame of the displacements, and that they are in the order of "
+            "the nodes."
         )
     elif len(moved) and np.median(moved) > _RIGID_MM:
         warnings.append(

@@ -120,7 +120,7 @@ def _pairs(ranked: Sequence[Area], band: Band | None) -> Pairs:
 def _not_trusted(odd: Iterable[Misfit]) -> str:
     """A sentence with the models that are not to be trusted; empty without any."""
     names = dict.fromkeys(one.model for one in odd if one.level == "distrust")
-    return f" The verdict on {', '.join(names)} is Do not trust." if names else ""
+    return f" Do not trust the rank of {', '.join(names)}: see the warning on its file." if names else ""
 
 
 def _under(one: LoadComparison, pairs: Pairs, odd: Sequence[Misfit], brief: bool) -> str:

@@ -270,7 +270,7 @@ def _tissues(one: LoadComparison) -> Table:
         "the error model. Perfect model: the area that noise alone would cause; an interval whose lower end is smaller "
         "begins at 0, because a perfect model is not excluded. Areas of tissues do not add up to that of all soft "
         "tissue, in which over- and underestimates cancel."
-        + f" {UNNAMED}: tissue of the mesh that has no name of the label map and lies outside all its labels."
+        + f" {UNNAMED}: tissue of the mesh whose name is not in the label map and that lies outside all labels."
         * any(a.tissue == UNNAMED for a in one.areas),
         cells(a for a in one.areas if a.model == NOTHING),
     )  # fmt: skip

@@ -143,7 +143,8 @@ def _model_forms(one: LoadComparison) -> Table:
         cells(nothing=False),
         "Over all strains, as measured: d+ is the area between the distributions where the measured maximum shear "
         "strain is larger, d− where it is smaller (Voyles and Roy 2015). Lower, upper: interval of the mean, from "
-        "model mean − d− to model mean + d+; that of a percentile is found in the same way. It has no stated coverage, "
-        "and always contains the measured mean. The factor for few samples is not used, because cells are not samples.",
+        "model mean − d− to model mean + d+; that of a percentile is found in the same way. These intervals "
+        "have no stated coverage; that of the mean contains the measured mean by construction. The factor "
+        "for few samples is not used, because cells are not samples.",
         cells(nothing=True),
     )

@@ -23,7 +23,7 @@ from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
 from dvc.io.transforms.interface_spline import FILE as INTERFACE_SPLINE
 from dvc.io.transforms.read import read_displacement, read_transform
 from dvc.io.transforms.write import ELASTIX_FILES
-from dvc.own_files import read_json
+from dvc.own_files import read_json, read_rows
 from dvc.trust.error_model import ErrorTable, read_error_model
 from dvc.trust.verdict import Verdict
 
@@ -73,6 +73,15 @@ class ResultFolder:
                 what = f"the verdict or the alignment is missing or damaged ({failure!r})"
                 raise InputError(f"{folder / QUALITY}: {what}. {AGAIN}") from failure
         return cls(folder, read_error_model(model).tables[0] if model.is_file() else None, verdict, aligned_on)
+
+    @property
+    def without_intervals(self) -> tuple[str, ...]:
+        """Tissues whose intervals are left out, as too few true values would lie in them; see `dvc.trust.gaps`."""
+        try:
+            rows = read_rows(self.folder / INTERVALS) if (self.folder / INTERVALS).is_file() else []
+            return tuple(dict.fromkeys(row["region"] for row in rows if np.isnan(float(row["low"]))))
+        except (OSError, ValueError, KeyError) as failure:
+            raise InputError(f"{self.folder / INTERVALS}: not a table of intervals ({failure!r}). {AGAIN}") from failure
 
     @property
     def load(self) -> str:

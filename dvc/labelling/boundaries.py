@@ -59,7 +59,7 @@ class CorrectedLabels:
 
 @checked
 def correct_labels(
-    image: Image, labels: LabelMap, marks: LabelMap | None = None, probability: Float32Array | None = None,
+    image: Image, labels: LabelMap, *, marks: LabelMap | None = None, probability: Float32Array | None = None,
     watch: Callable[[float], None] = lambda _: None,
 ) -> CorrectedLabels:  # fmt: skip
     """Correct a label map near a few marks; or, without marks, the boundaries of its bones and skin.

@@ -43,7 +43,7 @@ class CarriedLabels:
 
 @checked
 def labels_from(
-    image: Image, other: Image, labels: LabelMap, bone: Mask | None = None, body: Mask | None = None,
+    image: Image, other: Image, labels: LabelMap, bone: Mask | None = None, body: Mask | None = None, *,
     marks: LabelMap | None = None, watch: Callable[[float], None] = lambda _: None,
 ) -> TissueLabels:  # fmt: skip
     """Label the tissues of an unloaded image, given another subject's image and its label map.

@@ -167,7 +167,7 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     note = "In brackets: interval of 95 % coverage, from the error model." if known else ""
     if len(known) < len(intervals):
-        note = f"{note} No interval where its coverage is known to be too low (see the load).".strip()
+        note = f"{note} Without brackets: its coverage is known to be below 90 % (reason: section of the load).".strip()
     return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 
 

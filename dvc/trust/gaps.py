@@ -18,8 +18,8 @@ _OF_TENDON = (
     "as 79 % of the voxels."
 )
 _OF_MADE_SKIN = (
-    "No intervals in skin: with a label map made from the image, they contained only 60 to 80 % of the true values "
-    "where the fat pad slides."
+    "No intervals in skin: on phantoms whose fat pad slides, with a label map made from the image, they contained "
+    "only 60 to 80 % of the true statistics."
 )
 
 

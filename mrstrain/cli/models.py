@@ -115,7 +115,7 @@ def level(
         Path,
         typer.Argument(
             metavar="results",
-            help="Results folder of register, from whose record options that are not given are taken; or the unloaded "
+            help="Results folder of register, whose record supplies the options that you leave out; or the unloaded "
             "image alone.",
         ),
     ],

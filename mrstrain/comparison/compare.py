@@ -148,7 +148,8 @@ def compare(
         side_by_side("comparing", at_once) as each,
     ):
         cases = [
-            _case(m, files[load], tissues.grid, own.get(load, axes), Path(kept) / load) for load, m in compared.items()
+            _case(m, files[load], tissues.grid, own.get(load, axes), Path(kept) / f"models-{number}")
+            for number, (load, m) in enumerate(compared.items())
         ]
         reading_each, comparing_each, writing_each = (
             partial(_told, each, partial(tell, "compare", what)) for what in ("reading", "comparing", "writing")
@@ -203,7 +204,8 @@ def _case(
 ) -> validate.LoadCase:
     image, known = measurement.folder / REGISTERED, (measurement.table, measurement.verdict, measurement.aligned_on)
     read = partial(_read, measurement, files, grid, kept)
-    return validate.LoadCase(measurement.load, read, axes, *known, image if image.is_file() else None)
+    shown = image if image.is_file() else None
+    return validate.LoadCase(measurement.load, read, axes, *known, shown, measurement.without_intervals)
 
 
 def _read(

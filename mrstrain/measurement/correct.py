@@ -28,7 +28,7 @@ def corrected(
     assert drawn.labels is not None
     given = fit_mask(read_labels(drawn.labels, drawn.names), image.grid, str(drawn.labels))
     marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
-    made = correct_labels(image, given, marks, watch=watch)
+    made = correct_labels(image, given, marks=marks, watch=watch)
     inputs = {"load0": load0, **{role: of[0] for role, of in (drawn.files | strokes.files).items()}}
     record = provenance("label", inputs, {})
     moved = {name: {"mean_mm": mean, "rms_mm": rms} for name, (mean, rms) in made.moved_mm.items()}
@@ -50,8 +50,9 @@ def corrected(
 def changed_told(made: CorrectedLabels) -> str:
     """How much of a label map was changed, in a line."""
     voxels = round(made.changed * np.count_nonzero(made.labels.labels))
-    some = f"{100 * made.changed:.1f} % of the" if made.changed >= _LEAST_SHARE else f"{voxels}"
-    return f"{some} voxels have another label"
+    some = f"{100 * made.changed:.1f} % of the voxels" if made.changed >= _LEAST_SHARE else f"{voxels} voxel"
+    plural = "s" * (made.changed < _LEAST_SHARE and voxels != 1)
+    return f"{some}{plural} relabelled"
 
 
 def _moved(made: CorrectedLabels) -> tuple[str, Table]:

@@ -79,7 +79,7 @@ def label(
     bone, body = (None if one is None else read_mask(one, image.grid) for one in (masks.bone, masks.tissue))
     marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
     if before is not None:
-        again = correct_labels(image, before.labels, marks, before.probability, tell)
+        again = correct_labels(image, before.labels, marks=marks, probability=before.probability, watch=tell)
         assert again.probability is not None
         made = TissueLabels(again.labels, again.probability, (*before.notes, *again.notes))
         title, changed = "Label map corrected by strokes", [f"{changed_told(again)}."]
@@ -126,4 +126,4 @@ def _from_another(
     assert drawn.from_image is not None
     other, theirs = read_image(drawn.from_image), read_labels(drawn.labels, drawn.names)
     refuse_one_image_twice([("The image to label", image), ("the other subject's", other)])
-    return labels_from(image, other, theirs, bone, body, marks, tell)
+    return labels_from(image, other, theirs, bone, body, marks=marks, watch=tell)

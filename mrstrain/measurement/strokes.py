@@ -15,7 +15,7 @@ def read_marks(path: Path, names: Path | None) -> LabelMap:
         if unknown := [number for number in marks.names if number not in MARKED]:
             usual = ", ".join(f"{number} {name}" for number, name in MARKED.items())
             raise InputError(
-                f"{path}: the marks {few(unknown)} have no name. Give a table of names as mark_names (--mark-names), "
+                f"{path}: the strokes {few(unknown)} have no name. Give a table of names as mark_names (--mark-names), "
                 f"or use the usual numbers: {usual}."
             )
         return replace(marks, names={number: MARKED[number] for number in marks.names})

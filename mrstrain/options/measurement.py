@@ -34,8 +34,8 @@ def in_parallel(workers: int | None) -> int:
     """How many jobs run in parallel: as many as there are cores, or fewer where so many ``workers`` are asked for."""
     cores = usable_cores()
     if workers is not None and workers > cores:
-        told = "workers=%d: this machine has %d cores, so at most as many jobs run in parallel."
-        _log.warning(told, workers, cores)
+        told = "workers=%d exceeds the %d cores of this machine: at most %d jobs run in parallel."
+        _log.warning(told, workers, cores, cores)
     return min(workers or cores, cores)
 
 
@@ -67,9 +67,9 @@ class Marks(Options):
     marks: Annotated[
         Path | None,
         Cli(
-            help="Strokes: a label map with a few voxels painted in a tissue, on the page written by --draw, in "
-            "ITK-SNAP, 3D Slicer (.seg.nrrd) or any other program. Where a stroke contradicts the labels, these are "
-            "corrected within 8 mm."
+            help="Strokes: a label map with a few voxels painted in one or more tissues, on the page written by "
+            "--draw, in ITK-SNAP, 3D Slicer (.seg.nrrd) or any other program. Labels within 8 mm of a stroke that "
+            "contradicts them are corrected."
         ),
     ] = None
     """Strokes: a label map with a few voxels painted in a tissue, on the page written by draw_strokes, in ITK-SNAP, 3D

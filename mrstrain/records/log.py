@@ -20,8 +20,9 @@ from mrstrain import __version__
 from mrstrain.records.provenance import without_places
 
 LOG = "log.txt"
+_DICOM = ("", ".dcm", ".ima")
 _PACKAGES = ("dvc", "fe", "phantoms", "validate", "mrstrain")
-_ELSEWHERE = re.compile(r"(?<![\w.:/\\-])(?:~|[A-Za-z]:)?[/\\](?:[^\s'\"/\\:,;()]+[/\\])+")
+_ELSEWHERE = re.compile(r"(?<![\w.:/\\-])(?:file:|~|[A-Za-z]:)?[/\\]{1,3}(?:[^\s'\"/\\:,;()]+[/\\])+")
 _open = list["CommandLog"]()
 _log = logging.getLogger(__name__)
 
@@ -60,15 +61,18 @@ class CommandLog(logging.Handler):
         self._made = [folder for folder in self.place.parents if not folder.exists()]
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Append a record, with the traceback of its error."""
-        text = record.getMessage()
-        if record.exc_info and record.exc_info[1] is not None:
-            text += "\n" + "".join(traceback.format_exception(record.exc_info[1])).rstrip()
-        lines = timed(self.impersonal(text))
-        if self.begun:
-            append(self.place, lines)
-        else:
-            self._waiting += lines
+        """Append a record, with the traceback of its error; one that cannot be written stops nothing."""
+        try:
+            text = record.getMessage()
+            if record.exc_info and record.exc_info[1] is not None:
+                text += "\n" + "".join(traceback.format_exception(record.exc_info[1])).rstrip()
+            lines = timed(self.impersonal(text))
+            if self.begun:
+                append(self.place, lines)
+            else:
+                self._waiting += lines
+        except Exception:
+            self.handleError(record)
 
     def impersonal(self, text: str) -> str:
         """A text without the folders of its paths."""
@@ -76,9 +80,13 @@ class CommandLog(logging.Handler):
 
     def begin(self) -> None:
         """Write what has been kept so far."""
-        if not self.begun and self.place.parent.is_dir():
-            self.begun = True
-            append(self.place, self._waiting)
+        self.acquire()  # as other threads may log at the same time
+        try:
+            if not self.begun and self.place.parent.is_dir():
+                self.begun = True
+                append(self.place, self._waiting)
+        finally:
+            self.release()
 
     def remove_if_alone(self) -> None:
         """Remove the log, and the folders made for it, if it is new and the command has left nothing else."""
@@ -135,4 +143,17 @@ def _places(typed: Sequence[str]) -> dict[Path, tuple[str, str]]:
     there |= {way(folder) for folder in given for way in (Path.absolute, Path.resolve)}
     there |= {Path(place) for place in sys.path if os.path.isabs(place)} | {Path.cwd()}
     alone = {folder: "a folder" if len(folder.parts) > 1 else str(folder) for folder in there}  # a word, such as "data"
-    return {folder: ("", alone[folder]) for folder in there} | {Path.home(): (f"~{os.sep}", "~")}
+    series = {Path(os.path.normpath(value)) for value in values if _is_dicom(Path(value))}
+    alone |= dict.fromkeys(series, "a folder")
+    return {folder: ("", alone[folder]) for folder in there | series} | {Path.home(): (f"~{os.sep}", "~")}
+
+
+def _is_dicom(folder: Path) -> bool:
+    """Whether a folder holds files as those of a DICOM series are called; it often has the name of a patient."""
+    try:
+        return folder.is_dir() and any(
+            file.suffix.lower() in _DICOM and not file.name.startswith(".") and file.is_file()
+            for file in folder.iterdir()
+        )
+    except (OSError, ValueError):
+        return False

@@ -117,8 +117,9 @@ class StageRunner:
 
         Dask gives a stage to a worker at once, even to one that is busy for minutes while another soon has no work.
         """
-        connected = self._client.status == "running"
-        slots = (connected and sum(self._client.nthreads().values())) or 1
+        if self._client.status != "running":
+            return
+        slots = sum(self._client.nthreads().values()) or 1
         while self._waiting and len(self._under_way) < slots:
             call = max(self._waiting, key=lambda one: one.to_end_s)
             self._waiting.remove(call)
@@ -155,12 +156,14 @@ class StageRunner:
                 lost_s = 0.0 if lost_since is None else time.monotonic() - lost_since
                 answers = self._client.status == "running"
                 starts = answers and lost_s > _LOST_S and any(map(_processes_of, self._nannies))
-                if lost_s > (_STARTS_S if starts else _LOST_S):
-                    future = next(iter(self._under_way))
-                    return self._under_way.pop(future).name, "The scheduler, or every worker, has stopped.", 0.0
+                if self._client.status == "closed" or lost_s > (_STARTS_S if starts else _LOST_S):
+                    lost = next(iter(self._under_way), None)
+                    one = self._waiting.pop(0) if lost is None else self._under_way.pop(lost)
+                    return one.name, "The scheduler, or every worker, has stopped.", 0.0
                 if hung := self._hung():
                     return self._ended(hung)
         call = self._under_way.pop(future, None)
+        self._send()  # before the results of this stage are recorded
         if call is None:  # abandoned before
             return self.next()
         name = call.name

@@ -34,7 +34,9 @@ class StageRecord(BaseModel):
     key: str  # hash of all inputs
     made_utc: str
     seconds: float
-    files: dict[str, str]  # hash of the contents of each file that it wrote, by its place in the results folder
+    # Hash of the contents of each file that it wrote, by its place in the results folder; of an earlier version, with
+    # its size and date.
+    files: Mapping[str, str | tuple[int, int, str]]
     result: StageResult
     made_from: dict[str, Any] = {}  # hashes of its input files by name, and its arguments
     checksum: str = ""  # of all the others, as `sealed` computes it
@@ -99,7 +101,8 @@ class Ledger:
         if record.checksum != record.sealed().checksum:
             return None  # damaged: the stage is run again
         own = all(_within(self.out / name, stage.gives) for name in record.files)  # or it was tampered with
-        return record if own and self._contents(record.files) == record.files else None
+        known = {name: of if isinstance(of, str) else of[2] for name, of in record.files.items()}
+        return record if own and self._contents(known) == known else None
 
     def _contents(self, names: Iterable[str]) -> dict[str, str]:
         """Hash of the contents of each of these results that is there, whatever its size and date are."""

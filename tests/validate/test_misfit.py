@@ -115,7 +115,7 @@ def test_a_model_whose_bone_moves_is_told_and_one_that_moves_far_is_not_trusted(
     assert [one.level for one in odd] == [level] * (level is not None)
     done = compare([case("Load1", at_rest, models, error_table(0.0, 0.01))], labels())
     (under,) = done.ranking.statements
-    not_trusted = " The verdict on moved is Do not trust."
+    not_trusted = " Do not trust the rank of moved: see the warning on its file."
     if level is None:
         assert done.verdict is None
     else:

@@ -203,8 +203,8 @@ class GaussNewtonWithInterfaces(Engine):
         if share <= _UNLABELLED:
             return ""
         return (
-            f"{100 * share:.0f} % of the body has no label, but the error of {self.name} was measured with every "
-            "tissue labelled. Label the whole body, or use one smooth spline (--no-borders)."
+            f"{100 * share:.0f} % of the visible tissue has no label, but the error of {self.name} was measured with "
+            "every tissue labelled. Label all tissue, or use one smooth spline (--no-borders)."
         )
 
 

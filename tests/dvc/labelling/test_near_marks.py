@@ -33,7 +33,7 @@ def spoilt(where: BoolArray, number: int = 3) -> LabelMap:
 @pytest.mark.parametrize("centre", [IN_FAT, NEAR_SKIN])
 def test_a_mark_takes_back_what_is_wrong_and_leaves_all_else(centre: tuple[float, float, float]) -> None:
     given, mark = spoilt(ball(centre, 4.5)), ball(centre, 1.5)
-    made = correct_labels(body(), given, marks(fat=mark))
+    made = correct_labels(body(), given, marks=marks(fat=mark))
     assert made.labels.names == given.names
     assert np.mean(made.labels.labels != truth().labels) < 0.1 * np.mean(given.labels != truth().labels)
     changed = made.labels.labels != given.labels
@@ -48,14 +48,14 @@ def test_a_mark_takes_back_what_is_wrong_and_leaves_all_else(centre: tuple[float
 def test_probabilities_are_kept_bit_for_bit_beyond_the_reach() -> None:
     image = body()
     found, mark = label_tissues(image, BONE), ball(IN_FAT, 1.5)
-    made = correct_labels(image, found.labels, marks(muscle=mark), found.probability)
+    made = correct_labels(image, found.labels, marks=marks(muscle=mark), probability=found.probability)
     far = distance_transform_edt(~mark) > REACH_MM
     assert made.probability is not None
     assert np.array_equal(made.probability[:, far], found.probability[:, far])
     assert np.array_equal(made.labels.labels[far], found.labels.labels[far])
     assert (made.labels.region("muscle").inside)[mark].all()
     assert made.probability[2][mark].min() == 1.0
-    agreeing = correct_labels(image, found.labels, marks(fat=mark), found.probability)
+    agreeing = correct_labels(image, found.labels, marks=marks(fat=mark), probability=found.probability)
     assert np.array_equal(agreeing.probability, found.probability)
     assert agreeing.changed == 0.0
 
@@ -63,10 +63,10 @@ def test_probabilities_are_kept_bit_for_bit_beyond_the_reach() -> None:
 def test_marks_refer_to_labels_by_name_and_add_those_that_are_new() -> None:
     given = spoilt(np.zeros(GRID.shape, dtype=bool))
     inner = ball(IN_FAT, 2.0)
-    made = correct_labels(body(), given, marks(bone=ball(ONE, 2.0), FAT=inner))  # the bone is called calcaneus
+    made = correct_labels(body(), given, marks=marks(bone=ball(ONE, 2.0), FAT=inner))  # the bone is called calcaneus
     assert made.labels.names == given.names
     assert np.array_equal(made.labels.labels, given.labels)
-    made = correct_labels(body(), given, marks(vessel=inner, tendon=ball((-22.0, -22.0, -22.0), 5.0)))
+    made = correct_labels(body(), given, marks=marks(vessel=inner, tendon=ball((-22.0, -22.0, -22.0), 5.0)))
     assert made.labels.names == given.names | {5: "vessel"}
     assert made.labels.region("vessel").inside[inner].all()
     assert made.notes == ("The strokes of tendon were not used: they lie outside the label map.",)
@@ -76,12 +76,12 @@ def test_what_marks_cannot_correct_is_refused() -> None:
     given, mark = truth(), marks(fat=ball(IN_FAT, 2.0))
     nameless = LabelMap(GRID, given.labels, {number: f"label-{number}" for number in given.names})
     with pytest.raises(InputError, match="The labels have no names, so that strokes of fat cannot be assigned"):
-        correct_labels(body(), nameless, mark)
-    assert correct_labels(body(), nameless, LabelMap(GRID, mark.labels * 2, {2: "label-2"})).changed == 0.0
+        correct_labels(body(), nameless, marks=mark)
+    assert correct_labels(body(), nameless, marks=LabelMap(GRID, mark.labels * 2, {2: "label-2"})).changed == 0.0
     others = certain(spoilt(ball(IN_FAT, 4.0)))
     for wrong in (others, others[:3]):
         with pytest.raises(InputError, match="are not those of the labels"):
-            correct_labels(body(), given, mark, wrong)
+            correct_labels(body(), given, marks=mark, probability=wrong)
     with pytest.raises(InputError, match="can be corrected by marks only"):
         correct_labels(body(), given, probability=certain(given))
 

@@ -95,6 +95,31 @@ def test_a_log_names_no_patient_and_no_folder(tmp_path, monkeypatch) -> None:
         assert not [word for word in PLANTED if word in told]
 
 
+@pytest.mark.parametrize("ending", ["", ".dcm", ".IMA"])
+def test_the_folder_of_a_dicom_series_is_not_named(ending, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / NAME).mkdir()
+    (tmp_path / NAME / f"IM001{ending}").write_text("")
+    with logged(tmp_path / "out", ["mrstrain", "register", NAME, "b.nii", "--out", "out"]):
+        make_output(tmp_path / "out")
+        logging.getLogger("dvc").info("%s/IM001: of another series; //server/%s/a.nii", NAME, NAME)
+        logging.getLogger("dvc").info("file:///mnt/%s/a.nii", NAME)
+    told = (tmp_path / "out" / "log.txt").read_text()
+    assert NAME not in told
+    assert "mrstrain register 'a folder' b.nii --out out" in told
+    assert " IM001: of another series; a.nii" in told
+
+
+def test_a_record_that_cannot_be_written_stops_nothing(tmp_path, capsys) -> None:
+    """As a library may log one with too few arguments."""
+    with logged(tmp_path / "out", ["mrstrain", "register"]) as log:
+        make_output(tmp_path / "out")
+        log.handle(logging.makeLogRecord({"msg": "%d of", "args": ("a",)}))
+        logging.getLogger("dvc").warning("the next")
+    assert "the next" in (tmp_path / "out" / "log.txt").read_text()
+    assert "Logging error" in capsys.readouterr().err
+
+
 def test_an_error_in_a_log_names_no_folder(tmp_path) -> None:
     folder, home = tmp_path / PLACE / NAME, Path.home()
 

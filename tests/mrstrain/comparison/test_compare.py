@@ -46,6 +46,22 @@ def with_errors(study: Path, bias: float, sd: float) -> None:
         )
 
 
+def test_a_tissue_without_intervals_in_the_measurement_has_none_in_the_comparison(study: Path) -> None:
+    with_errors(study, 0.0, 0.02)
+    for load in LOADS:
+        numbers = {"skin": "0.1,0.1,,", "fat": "0.1,0.1,0.08,0.12"}
+        lines = [f"{tissue},median,{of.replace(',,', ',nan,nan')},Trust" for tissue, of in numbers.items()]
+        head = "region,statistic,found,estimate,low,high,verdict"
+        (study / "measured" / load / "intervals.csv").write_text("\n".join([head, *lines]) + "\n")
+    done = compare(study / "measured", [study / "half"], **given(study))
+    areas = {(r["model"], r["load"], r["tissue"]): r for r in rows(study / "out" / "areas.csv")}
+    of_skin, of_fat = (areas["half", "Load1", tissue] for tissue in ("skin", "fat"))
+    assert np.isnan(float(of_skin["low_ml"]))
+    assert not np.isnan(float(of_fat["low_ml"]))
+    assert {r["tissue"] for r in rows(study / "out" / "decomposition.csv")} == {"fat"}
+    assert "Load1: no intervals in skin; the measurement gives the reason." in done.comparison.notes
+
+
 def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     with_errors(study, 0.0, 0.02)
     done = compare(study / "measured", [study / "half", study / "right"], on_image=True, **given(study))

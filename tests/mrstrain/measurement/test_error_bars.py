@@ -199,12 +199,12 @@ def test_an_error_model_is_for_pairs_like_those_of_its_study() -> None:
     unlabelled = labels.labels.copy()
     unlabelled[12:20] = 0
     partly = replace(pair, labels=replace(labels, labels=unlabelled))
-    assert "of the body has no label" in engine.unlike_study(partly, kept)
+    assert "of the visible tissue has no label" in engine.unlike_study(partly, kept)
     assert "with a rigid bone" in engine.unlike_study(replace(partly, bone=None), freed)
     generous = widened(body, 3.2)  # air around the tissue has no label, and needs none
     assert np.mean(labels.labels[generous.inside] == 0) > 0.3
     assert engine.unlike_study(replace(pair, body=generous), kept) == ""
-    assert "of the body has no label" in engine.unlike_study(replace(partly, body=generous), kept)
+    assert "of the visible tissue has no label" in engine.unlike_study(replace(partly, body=generous), kept)
 
 
 def twin_of(maps: StrainMaps, sd: float, bias: float = 0.03) -> TwinCheck:

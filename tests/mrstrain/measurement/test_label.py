@@ -99,7 +99,7 @@ def test_marks_without_names_have_the_usual_ones(folder: Path, tmp_path: Path) -
     write_labels(
         place, LabelMap(truth.grid, np.where(drawn == 5, 9, drawn), {n: f"label-{n}" for n in (1, 2, 3, 4, 9)})
     )
-    with pytest.raises(InputError, match=r"marks 9 have no name"):
+    with pytest.raises(InputError, match=r"strokes 9 have no name"):
         read_marks(place, None)
     write_labels(place, LabelMap(truth.grid, drawn, {n: f"label-{n}" for n in range(1, 6)}))
     load0, bone, out = folder / "Load0.nii.gz", folder / "bone.nii.gz", tmp_path / "made.nii.gz"
@@ -148,7 +148,7 @@ def test_a_drawn_label_map_is_corrected_and_its_files_agree(folder: Path, tmp_pa
     record = json.loads((tmp_path / "out" / "tissues.json").read_text())
     assert record["changed"] == np.mean((made.labels != misdrawn(truth, 1).labels)[truth.labels > 0])
     assert record["moved"]["bone"]["mean_mm"] < -0.5
-    assert told[0].startswith(f"{100 * record['changed']:.1f} % of the voxels have another label")
+    assert told[0].startswith(f"{100 * record['changed']:.1f} % of the voxels relabelled")
     assert f"bone {record['moved']['bone']['mean_mm']:+.2f}" in told[1]
     assert (tmp_path / "out" / "tissues.png").is_file()
     assert made_from_image(tmp_path / "out" / "tissues.nii.gz") is None  # it is the user's
@@ -241,7 +241,7 @@ def test_strokes_of_slicer_correct_a_made_map_near_them_and_its_probabilities(fo
     assert made_from_image(out) == LabelsFromImage(record["uncertain"], tuple(record["notes"]))
     assert told.section.title == "Label map corrected by strokes"
     assert np.mean(changed[before.labels > 0]) < 0.001
-    assert told.summary()[0] == f"{changed.sum()} voxels have another label."
+    assert told.summary()[0] == f"{changed.sum()} voxels relabelled."
     assert (tmp_path / "tissues.png").is_file()
     again = tmp_path / "again.nii.gz"  # what was corrected can be corrected
     mrstrain.label(folder / "Load0.nii.gz", labels=out, names=tmp_path / "tissues.csv", marks=drawn, out=again)
@@ -286,8 +286,8 @@ def test_strokes_that_cannot_correct_a_map_are_refused(folder: Path, tmp_path: P
 def test_strokes_go_along_with_another_subjects_labels(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def asked(*given: object) -> TissueLabels:
-        assert given[5].names == {7: "fat"}
+    def asked(*_: object, marks: LabelMap, **__: object) -> TissueLabels:
+        assert marks.names == {7: "fat"}
         raise InputError("as asked")
 
     monkeypatch.setattr(labelling, "labels_from", asked)

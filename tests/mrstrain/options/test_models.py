@@ -338,8 +338,10 @@ def test_far_too_many_threads_are_refused_and_workers_limited_with_the_number_of
     with pytest.raises(ParameterError, match=r"must be 1 to 256; got 100000\. This machine has 2 cores\."):
         Settings(threads=100000)
     assert Threads(threads=256).threads == Settings(threads=256).threads == 256
+    caplog.clear()
     assert (in_parallel(None), in_parallel(1), in_parallel(2)) == (2, 1, 2)
     assert caplog.messages == []
+    caplog.clear()
     assert in_parallel(100000) == 2
-    assert caplog.messages == ["workers=100000: this machine has 2 cores, so at most as many jobs run in parallel."]
+    assert caplog.messages == ["workers=100000 exceeds the 2 cores of this machine: at most 2 jobs run in parallel."]
     assert Running(workers=100000).shares(8) == (2, 1)

@@ -33,6 +33,19 @@ def test_a_result_that_was_damaged_is_made_again(folder, same_date):
     assert result.read_bytes() == content
 
 
+def test_a_record_of_an_earlier_version_is_read(folder):
+    """It held the size and the date of each file too; a study of hours need not run again for that."""
+    ran(folder)
+    file = folder / "results" / ".study" / "register a.json"
+    record = StageRecord.model_validate_json(file.read_bytes())
+    state = (folder / "results" / "register_a").stat()
+    files = {name: (state.st_size, state.st_mtime_ns, of) for name, of in record.files.items()}
+    file.write_text(record.model_copy(update={"files": files}).sealed().model_dump_json())
+    assert ran(folder)[0] == []
+    (folder / "results" / "register_a").write_text("[8]")
+    assert ran(folder)[0] == ["register a", "compare"]
+
+
 @pytest.mark.parametrize(("right", "wrong"), [("1.0", "1e400"), ("a done", "b done"), ("{", "["), ("}", "")])
 def test_a_record_that_was_damaged_is_made_again(folder, right, wrong):
     ran(folder)

@@ -220,8 +220,22 @@ def test_a_stage_waits_for_whichever_worker_is_free_first_and_the_longest_goes_f
     assert runner.next()[0] == "d"
     futures[0].set_result((StageResult(()), 1.0))
     assert runner.next()[0] == "long"
-    assert sent[3:] == ["c"]
+    assert sent[3:] == ["c", "e"]
     assert runner.busy
+
+
+def test_stages_that_wait_for_a_scheduler_that_has_stopped_fail_one_by_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "_LOOK_EVERY_S", 0.01)
+    machine = Machine()
+    monkeypatch.setattr(machine, "submit", lambda *_, **__: Future())  # which never ends
+    runner = StageRunner(machine, lambda *_: None)
+    for name in ("a", "b", "c", "d"):
+        runner.begin(name, "mesh", {}, tmp_path / "lock")
+    machine.status = "closed"  # as Dask's client is, some seconds after its scheduler is gone
+    ended = [runner.next() for _ in range(4)]
+    assert sorted(name for name, _, _ in ended) == ["a", "b", "c", "d"]
+    assert {outcome for _, outcome, _ in ended} == {"The scheduler, or every worker, has stopped."}
+    assert not runner.busy
 
 
 def test_a_stage_that_hangs_is_named_then_ended_and_the_others_finish(tmp_path, monkeypatch):
