@@ -1,5 +1,6 @@
 """Labels "auto" of `register`: who is told of them, and what strokes do."""
 
+import html
 import json
 from pathlib import Path
 
