@@ -3,12 +3,13 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from dvc import Engine, GaussNewton
+from dvc import Engine
 from dvc.errors import InputError
 from dvc.file_names import one_spelling
 from dvc.io.images.labels import read_names
 from dvc.measurement.subject import bones_of
 from dvc.report.page import Section
+from mrstrain.measurement.engines import GAUSS_NEWTON
 from mrstrain.options.measurement import MADE_LABELS, Marks, RegistrationOptions, Scans, SubjectFiles
 from mrstrain.records.inputs import made_labels
 
@@ -89,7 +90,7 @@ def next_step(
     files: SubjectFiles, cases: Sequence[str], scans: Scans, how: RegistrationOptions, engine: Engine
 ) -> str | None:
     """What to tell somebody who registers without a label map where one could be made and would lower the error."""
-    if files.labels is not None or how.borders is False or engine.family != GaussNewton.family:
+    if files.labels is not None or how.borders is False or engine.family != GAUSS_NEWTON:
         return None
     try:
         check_auto(files, Marks(), cases, scans)

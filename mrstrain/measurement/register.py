@@ -39,7 +39,7 @@ from mrstrain.options.measurement import (
     SubjectFiles,
 )
 from mrstrain.options.model import Flag
-from mrstrain.records.durations import LABELS, REPORT, WRITING, registrations
+from mrstrain.records.durations import LABELS, REPORT, registrations
 from mrstrain.records.inputs import (
     alone,
     case_names,
@@ -50,7 +50,7 @@ from mrstrain.records.inputs import (
 )
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import OnProgress, expect
-from mrstrain.records.time_left import FAILED
+from mrstrain.records.time_left import FAILED, WRITING
 
 _log = logging.getLogger(__name__)
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads

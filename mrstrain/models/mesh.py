@@ -13,10 +13,11 @@ from dvc.report.drawing import ENDINGS, save_figure
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
 from mrstrain.options.modelling import Labelling, Meshing
-from mrstrain.records.durations import MESHING, WRITING, cells_of, meshing as expected_of
+from mrstrain.records.durations import MESHING, cells_of, meshing as expected_of
 from mrstrain.records.inputs import alone, output_folder
 from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import provenance
+from mrstrain.records.time_left import WRITING
 
 _CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0
 _CASE = "mesh"  # of progress

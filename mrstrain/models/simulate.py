@@ -24,12 +24,12 @@ from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores, in_parallel
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
-from mrstrain.records.durations import PASSED, SIMULATING, WRITING, PathSize, figures_of, simulations
+from mrstrain.records.durations import PASSED, SIMULATING, PathSize, figures_of, simulations
 from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.provenance import provenance
-from mrstrain.records.time_left import STARTING
+from mrstrain.records.time_left import STARTING, WRITING
 
 LOADS = (
     fe.LoadStep("Load1", 140.0), fe.LoadStep("Load2", 15.0),

@@ -9,13 +9,13 @@ from dvc import LabelMap
 from dvc.arrays import BoolArray, IntArray
 from dvc.registration.engine import Cost
 from fe import MaterialSet
-from mrstrain.records.time_left import STARTING, Expected
+from mrstrain.records.time_left import STARTING, WRITING, Expected
 
 LABELS = "labels"
 """The case of the label map that `register` makes."""
 REPORT = "report"
 """The case, or the last part of one, in which tables, figures and the report of a command are written."""
-MESHING, SIMULATING, WRITING = "meshing", "simulating", "writing"
+MESHING, SIMULATING = "meshing", "simulating"
 """Parts of a mesh and of a simulation."""
 
 # From 13 recorded demonstrations on two idle cores (2.3 million voxels; 35,000 or 80,000 cells, four loads), and from

@@ -17,6 +17,8 @@ _STARTING_S = 1.5  # of a command, before its stages are known
 
 STARTING = "starting"
 """The stage of a command before its stages are known."""
+WRITING = "writing"
+"""The part of a stage in which its results are written."""
 FAILED = "failed"
 """The last part of a stage that ends by an error."""
 

@@ -154,7 +154,7 @@ def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdic
     if not verdicts:
         return None
     inputs = [section.verdict for section in compared[:1] if section.verdict is not None]
-    verdict = worst([*verdicts, *(one for one in inputs if one.level != "distrust")])
+    verdict = worst([*verdicts, *inputs])
     if verdict.reasons:
         return verdict
     registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"

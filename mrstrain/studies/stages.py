@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 from dvc import Verdict
 from dvc.report.page import Section
 from mrstrain.options.model import Options
-from mrstrain.records.durations import WRITING
 from mrstrain.records.progress import NOTE
+from mrstrain.records.time_left import WRITING
 
 _M = TypeVar("_M", bound=Options)
 Tell = Callable[[str, float], None]

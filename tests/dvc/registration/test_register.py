@@ -307,7 +307,7 @@ def test_missing_voxels_are_left_out(tiny_pair, worker):
     [
         ({"engine": "gauss-newton"}, "Settings.of"),
         ({"align_on": "bones"}, "bone or image or none"),
-        ({"threads": 0}, "1 or"),
+        ({"threads": 0}, "1 to 256"),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused_when_they_are_made(given, told):

@@ -197,8 +197,9 @@ def test_a_command_ends_and_keeps_what_is_finished(case, group, images, tmp_path
 
 
 IN_A_TERMINAL = """
-import fcntl, os, sys, termios
+import fcntl, os, signal, sys, termios
 
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which "nohup" leaves ignored
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 os.execv(sys.executable, [sys.executable, "-m", "mrstrain", *sys.argv[1:]])
 """

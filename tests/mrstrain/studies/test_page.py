@@ -85,7 +85,7 @@ def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(stu
     sound = {"register_Load1": SOUND, "register_Load2": SOUND}
     only = ended(study, **sound)
     told = head(page_of(study, only))
-    assert told.startswith("Heel Trust All 2 registrations passed all checks. Not requested")
+    assert told.startswith("Heel Measurement: Trust All 2 registrations passed all checks. Not requested")
     assert told.endswith("without a result: mesh, simulate trebbi, compare.")
     assert StudyRun(study, only).complete
     assert "Not requested, and without a result: mesh, simulate trebbi, compare." in StudyRun(study, only).summary()
@@ -105,19 +105,18 @@ def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(stu
 def test_a_registration_that_is_not_to_be_trusted_heads_the_report(study: Study) -> None:
     folded = StageResult((), (Section("Load2", Verdict("distrust", ("It folds.",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=folded)))
-    assert told.startswith("Heel Do not trust Load2, registration (Do not trust): It folds.")
+    assert told.startswith("Heel Measurement: Do not trust Load2, registration (Do not trust): It folds.")
     # the comparison has the same reason, which is given once
     poor = Verdict("caution", ("The images agree poorly.",))
     doubted = ended(study, register_Load1=StageResult((), (Section("Load1", poor),)), register_Load2=SOUND,
                     compare=StageResult((), (Section("Models", verdict_on({"Load1": poor})),)))  # fmt: skip
     assert head(page_of(study, doubted)).count("The images agree poorly.") == 1
-    # a comparison made of it before is not what is there now
-    compared = StageResult((), (Section("Models", Verdict("distrust", ("It folds.",))),))
+    compared = StageResult((), (Section("Models", Verdict("distrust", ("Its bone moves by 134 mm.",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=SOUND, compare=compared)))
-    assert told.startswith("Heel Trust")
+    assert told.startswith("Heel Measurement and model files: Do not trust Its bone moves by 134 mm.")
     placed = StageResult((), (Section("Models", Verdict("caution", ("In metres?",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=SOUND, compare=placed)))
-    assert told.startswith("Heel Use with care In metres?")
+    assert told.startswith("Heel Measurement and model files: Use with care In metres?")
 
 
 def test_the_table_of_stages_repeats_neither_reasons_nor_what_sections_tell(study: Study) -> None:

@@ -80,11 +80,11 @@ def test_the_report_of_a_study_prints_whole_and_no_page_ends_with_a_heading(tab,
 
 
 @pytest.mark.parametrize("paper", PAPERS)
-def test_a_figure_of_seven_panels_prints_on_one_sheet_with_its_heading_and_caption(
+def test_a_figure_of_many_panels_prints_on_one_sheet_with_its_heading_and_caption(
     tab: Tab, tmp_path: Path, paper: str
 ) -> None:
     mesh = block((6, 6, 6), (60.0, 60.0, 60.0))
-    panels = [Slice(f"model {n}", np.zeros_like(mesh.points_mm), np.full(len(mesh.cells), 0.1 * n)) for n in range(7)]
+    panels = [Slice(f"model {n}", np.zeros_like(mesh.points_mm), np.full(len(mesh.cells), 0.1 * n)) for n in range(22)]
     png = png_bytes(slice_sheet(mesh, panels, np.eye(3), np.full(3, 30.0)))
     width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
     assert height > 2 * width  # scaled to the width of a sheet, it is taller than one
