@@ -130,7 +130,7 @@ def test_the_curves_of_a_figure_stand_beside_it(comparison: Comparison, folder: 
 
 
 def test_a_report_says_what_unnamed_tissue_is(comparison: Comparison) -> None:
-    mesh, said = cube(4), "unnamed: tissue of the mesh that has no name of the label map"
+    mesh, said = cube(4), "unnamed: tissue of the mesh whose name is not in the label map"
     aside = replace(labels(), labels=np.where(labels().labels == 2, 0, labels().labels))
     bare = replace(mesh, regions={"part": np.arange(len(mesh.cells))})
     one = case("Load1", sheared(0.45), [result("half", bare, sheared(0.2))], error_table(0.0, 0.01))
