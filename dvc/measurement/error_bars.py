@@ -226,7 +226,7 @@ def _held(table: ErrorTable) -> str:
     share, where = 95, "the parts of the study left out"
     if table.widening_of:
         share, where = 97, "image pairs moved by finite-element solutions"
-    return f"Intervals are widened by a factor of {times}, so that they contain {share} % of the true values in {where}."
+    return f"Intervals are widened by a factor of {times}, to contain {share} % of the true values in {where}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:

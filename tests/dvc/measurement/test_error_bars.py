@@ -72,6 +72,6 @@ def test_an_interval_from_drawn_fields_is_as_wide_as_that_of_the_table():
 def test_the_fraction_is_told_for_which_the_factor_was_found():
     """95 % where parts of the study itself were left out, 97 % for the models that ship; neither is a guarantee."""
     own = replace(TABLE, widening=2.0)
-    assert "a factor of 2.0, so that they contain 95 % of the true values in the parts" in error_bars._held(own)
+    assert "a factor of 2.0, to contain 95 % of the true values in the parts" in error_bars._held(own)
     shipped = error_bars._held(replace(own, widening_of={"fat": 3.0, "skin": 4.0}))
-    assert "a factor of 3.0 to 4.0, so that they contain 97 % of the true values in image pairs" in shipped
+    assert "a factor of 3.0 to 4.0, to contain 97 % of the true values in image pairs" in shipped
