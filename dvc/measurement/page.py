@@ -166,8 +166,8 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
 
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     note = "In brackets: interval of 95 % coverage, from the error model." if known else ""
-    if len(known) < len(intervals):
-        note = f"{note} Without brackets: its coverage is known to be below 90 % (reason: section of the load).".strip()
+    if bare := dict.fromkeys(i.region for i in intervals if np.isnan(i.low)):
+        note = f"{note} No interval in {', '.join(bare)}: its coverage is known to be below 90 %.".strip()
     return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 
 

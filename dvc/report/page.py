@@ -107,6 +107,10 @@ class Estimate:
         low = self.value if self.interval is None else self.interval[0]
         return low if np.isfinite(low) else self.value
 
+    def reaches(self, other: Self) -> bool:
+        """Whether its interval overlaps with another one, or reaches its lower end; not where its own is not known."""
+        return self.interval is not None and self.interval[1] >= other.least
+
     def __str__(self) -> str:
         value, *ends = (f"{n:z.3f}" if np.isfinite(n) else shown(n) for n in (self.value, *(self.interval or ())))
         return f"{value} ({' to '.join(ends)})" if ends else value

@@ -70,10 +70,18 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     least = _NEARLY * max(high.least for high, _ in known)
     likely = [one for one in known if one[0].least >= least]
     high, (load, tissue, median, *_) = max(likely, key=lambda one: one[0].value)
-    force = f" ({beside.forces[str(load)]})" if str(load) in beside.forces else ""
-    told = f"The most strained tissue is {tissue} under {load}{force}: measured maximum shear strain {median} in the "
-    told += f"median and {high} at the 95th percentile"
+    under = f"{load} ({beside.forces[str(load)]})" if str(load) in beside.forces else str(load)
+    several = len({row[1] for _, row in known}) > 1
+    told = (
+        f"The most strained tissue is {tissue} under {under}"
+        if several
+        else f"{str(tissue).capitalize()} under {under}"
+    )
+    told += f": measured maximum shear strain {median} in the median and {high} at the 95th percentile"
     told += "." if high.interval is None else ", with 95 % intervals in brackets."
+    overlapping = [str(row[1]) for other, row in known if row[0] == load and row[1] != tissue and other.reaches(high)]
+    if overlapping:
+        told += f" It may be as large in {' and '.join(overlapping)}, as the intervals overlap."
     if beside.floor is not None:
         told += f" The noise floor is {beside.floor.max_shear_p50:.3f} and {beside.floor.max_shear_p95:.3f}."
     return (told,)
@@ -88,5 +96,9 @@ def table_of_loads(measured: Sequence[Section]) -> Table | None:
     if not tables:
         return None
     rows = tuple((load, *row) for load, of in tables for row in of.rows if not is_bones_name(str(row[0])))
-    note = _NOTE.format(_INTERVALS if any(of.note for _, of in tables) else "")
+    known = any(of.note for _, of in tables)
+    note = _NOTE.format(_INTERVALS if known else "")
+    bare = [str(row[1]) for row in rows if isinstance(row[3], Estimate) and row[3].interval is None]
+    if known and bare:
+        note += f" No interval in {' and '.join(dict.fromkeys(bare))}: the registration of the load gives the reason."
     return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, note)

@@ -68,6 +68,6 @@ def test_tables_show_a_dash_and_no_interval_is_made_of_draws(known) -> None:
     rows = [RegionRow(name, "max_shear", 1, 1.0, 1, *[0.3] * 8) for name in REGIONS]
     short = summary_table(rows, found.intervals)
     assert ["(" in str(row[1]) for row in short.rows] == [True, False, True]
-    assert "Without brackets: its coverage is known to be below 90 %" in short.note
+    assert "No interval in Skin: its coverage is known to be below 90 %." in short.note
     with pytest.raises(InputError, match=r"Skin has no interval\. No standard"):
         bars.interval_of([0.3, 0.3], "Skin")

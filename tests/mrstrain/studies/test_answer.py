@@ -49,8 +49,8 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
     assert not first.folded
     assert areas.folded  # one small table is what a reader sees first
     assert first.paragraphs == (
-        "The most strained tissue is fat under Load1: measured maximum shear strain 0.131 (0.030 to 0.139) in the "
-        "median and 0.420 at the 95th percentile.",
+        "Fat under Load1: measured maximum shear strain 0.131 (0.030 to 0.139) in the median and 0.420 at the 95th "
+        "percentile.",
     )
     table = replace(table, rows=tuple(tuple(map(str, row)) for row in table.rows))
     assert table.columns == ("load", "tissue", "median", "95th percentile", "best match")
@@ -106,11 +106,15 @@ def test_the_most_strained_tissue_is_surely_so() -> None:
     beside = MeasuredBeside({"Load1": "140 N"}, NoiseFloor(0.01, 0.01, 0.0112, 0.0292, 0.1))
     assert most_strained(Table("Measured", columns, rows), beside) == (
         "The most strained tissue is fat under Load1 (140 N): measured maximum shear strain 0.300 (0.200 to 0.400) in "
-        "the median and 0.419 (0.400 to 0.500) at the 95th percentile, with 95 % intervals in brackets. The noise "
-        "floor is 0.011 and 0.029.",
+        "the median and 0.419 (0.400 to 0.500) at the 95th percentile, with 95 % intervals in brackets. It may be as "
+        "large in muscle, as the intervals overlap. The noise floor is 0.011 and 0.029.",
     )
     below_zero = ("Load2", "tendon", fat[0], Estimate(0.5, (-0.45, 0.759)))
     assert "is fat under Load1" in most_strained(Table("Measured", columns, (rows[1], below_zero)))[0]
+    apart = ("Load1", "muscle", fat[0], Estimate(0.3, (0.2, 0.399)))
+    assert "as large" not in most_strained(Table("Measured", columns, (rows[1], apart)))[0]
+    (alone,) = most_strained(Table("Measured", columns, (("Load1", "soft tissue", *fat),)))
+    assert alone.startswith("Soft tissue under Load1: measured maximum shear strain 0.300")
     alike = {"fat": 0.4195, "skin": 0.4202}  # 0.420 in the table
     without = tuple(("Load1", name, Estimate(0.3), Estimate(high)) for name, high in alike.items())
     (plain,) = most_strained(Table("Measured", columns, without))
