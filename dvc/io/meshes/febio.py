@@ -32,6 +32,7 @@ _NODE_DATA, _TIME, _STATUS = (0x02020000, 0x02020300), (0x02010000, 0x02010002),
 _NO_STEPS_END = 2  # status of a state that is written at another event: an iteration, or the end of the run
 _VARIABLE_ID, _VARIABLE_DATA = 0x02020002, 0x02020003
 _DISPLACEMENT = "displacement"
+_CUT = "the last section is incomplete: FEBio was stopped while it wrote the file, or the copy ended early"
 _PIECE = 1 << 16
 
 # Of FEBio's number of the element type: nodes in the file, and the kind in meshio's names with those that are taken.
@@ -74,7 +75,7 @@ def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
         tag, size = struct.unpack_from("<II", data, at) if len(data) >= at + 8 else (0, 0)
         if tag in (_ROOT, _MESH, _STATE):
             if at + 8 + size > len(data):
-                raise ValueError("the last section is incomplete")
+                raise ValueError(_CUT)
             yield tag, data[at + 8 : at + 8 + size]
             at += 8 + size
         else:
@@ -83,7 +84,7 @@ def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
                 plain += stream.decompress(data[at : at + _PIECE])
                 at = min(at + _PIECE, len(data))
             if not stream.eof:
-                raise ValueError("the last section is incomplete")
+                raise ValueError(_CUT)
             yield from _chunks(bytes(plain))
             at -= len(stream.unused_data)
 
