@@ -14,6 +14,8 @@ from mrstrain.records.provenance import provenance
 from mrstrain.truth.accuracy_page import HOW_TO_READ, motion_of, sections_of
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow
 
+_HEELS, _STRAINED = 2, 3  # motions with strain, at least, for an error model
+
 
 @dataclass(frozen=True, slots=True)
 class AccuracyStudy:
@@ -28,6 +30,8 @@ class AccuracyStudy:
         Rows of the tables.
     failures : dict
         Name of each case without a result, and why.
+    too_few : tuple of str
+        A sentence on each engine that was given too few heels or motions for an error model.
     """
 
     out: Path
@@ -36,6 +40,7 @@ class AccuracyStudy:
     resolution: tuple[ResolutionRow, ...]
     coverage: tuple[CoverageRow, ...]
     failures: dict[str, str]
+    too_few: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, out: Path, runs: Sequence[ErrorSamples], failures: dict[str, str]) -> Self:
@@ -64,10 +69,12 @@ class AccuracyStudy:
         about = {"cases": list(seconds), "failures": failures, "presets": presets, "seconds_of_registration": seconds}
         record = provenance("accuracy", {}, about)
         write_json(out / PROVENANCE, record)
-        study = cls(out, errors, floors, resolution, coverage, failures)
+        few = _too_few(runs)
+        study = cls(out, errors, floors, resolution, coverage, failures, few)
         with whole_folder(out / FIGURES) as folder:
             sections = sections_of(errors, floors, resolution, coverage, failures, folder)
         notes = [f"Incomplete: {len(failures)} of {len(runs) + len(failures)} cases failed."] if failures else []
+        notes += few
         title, lines = "Accuracy of registration engines", record_lines(record)
         write_report(out / REPORT, title, None, sections, [HOW_TO_READ], lines, notes=notes)
         return study
@@ -86,7 +93,22 @@ class AccuracyStudy:
             if r.by == "all" and r.tissue == "fat"
         ]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
-        return [*lines, f"Report: {self.out / REPORT}"]
+        return [*lines, *self.too_few, f"Report: {self.out / REPORT}"]
+
+
+def _too_few(runs: Sequence[ErrorSamples]) -> tuple[str, ...]:
+    """A sentence on each engine with too few heels, or motions with strain, for an error model."""
+    found = []
+    for preset in dict.fromkeys(r.case.preset for r in runs):
+        strained = [r.case for r in runs if r.case.preset == preset and r.case.motion != "still"]
+        heels, motions = (len({getattr(case, of) for case in strained}) for of in ("seed", "motion"))
+        if heels < _HEELS or motions < _STRAINED:
+            found.append(
+                f"{preset}: do not rely on the error model; its intervals may contain far fewer than 95 % of the true "
+                f"values (coverage.csv). It needs {_HEELS} heels and {_STRAINED} motions with strain or more; this "
+                f"study has {heels} and {motions}."
+            )
+    return tuple(found)
 
 
 def _source(runs: Sequence[ErrorSamples]) -> str:
