@@ -122,9 +122,10 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
     """Check a model against the label map; returns each possible input error.
 
     Reported are models with cells that are there twice, of which less than 95 % lies in the labelled soft tissue, whose
-    tissue names agree with the label map in under 80 % of the volume, that move by over 1 mm at the bone (by over
-    50 mm: "Do not trust"), or whose mean change of cell volume is over 15 %. Errors as `check_in_tissue`. ``bone`` has
-    the points of the bones' voxels, LPS mm, if they are known already.
+    tissue names agree with the label map in under 80 % of the volume, that move by over 1 mm at the bone, or whose mean
+    change of cell volume is over 15 %. Over 50 mm at the bone, or in the median of a model that no bone touches, is "Do
+    not trust". Errors as `check_in_tissue`. ``bone`` has the points of the bones' voxels, LPS mm, if they are known
+    already.
     """
     mesh, warnings, wrong = result.mesh, list[str](), list[str]()
     if len(again := repeated_rows(np.round(mesh.centroids_mm / _SAME_PLACE_MM))):
@@ -146,14 +147,16 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
         )
     of_bone = bone or _points_of_bone(labels, bones)
     distance = of_bone.query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0]
-    moved = np.linalg.norm(result.deformation.u_mm[distance < _NEAR_BONE_MM], axis=1)
+    touching = distance < _NEAR_BONE_MM
+    where, nodes = ("at the bone", touching) if touching.any() else ("in the median of its nodes", ~touching)
+    moved = np.linalg.norm(result.deformation.u_mm[nodes], axis=1)
     if len(moved) and np.median(moved) > _FAR_MM:
         wrong.append(
-            f"the model moves by {np.median(moved):.0f} mm at the bone, more than any load would cause ('Do not trust' "
+            f"the model moves by {np.median(moved):.0f} mm {where}, more than any load would cause ('Do not trust' "
             f"above {_FAR_MM:g} mm). Check the unit and frame of the displacements, and that they are in the order of "
             "the nodes."
         )
-    elif len(moved) and np.median(moved) > _RIGID_MM:
+    elif touching.any() and np.median(moved) > _RIGID_MM:
         warnings.append(
             f"the model moves by {np.median(moved):.1f} mm at the bone, but the measurement is relative to the bone; "
             "remove the rigid motion of the bone from the model."

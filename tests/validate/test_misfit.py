@@ -122,6 +122,12 @@ def test_a_model_whose_bone_moves_is_told_and_one_that_moves_far_is_not_trusted(
         assert done.verdict.level == level
         assert f"Load1: moved: the model moves by {moved_mm:g}" in done.verdict.reasons[0]
     assert under.endswith(not_trusted) == (level == "distrust")
+    inner = mesh.cells[(mesh.points_mm[mesh.cells][..., 0] > 4.0).all(axis=1)]  # no bone touches it
+    apart = TetMesh(mesh.points_mm, inner, {"fat": np.arange(len(inner))}, {})
+    told = [
+        one.level for one in misfits(result("apart", apart, moved), labels(), ["bone"]) if "the model moves" in one.told
+    ]
+    assert told == ["distrust"] * (level == "distrust")
     if level == "distrust":
         assert "unit and frame of the displacements, and that they are in the order of the nodes" in odd[0].told
         several = [case(load, at_rest, models, error_table(0.0, 0.01)) for load in ("Load1", "Load2")]
