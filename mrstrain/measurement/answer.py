@@ -80,7 +80,7 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     told += f": measured maximum shear strain {median} in the median and {high} at the 95th percentile"
     told += "." if high.interval is None else ", with 95 % intervals in brackets."
     overlapping = [str(row[1]) for other, row in known if row[0] == load and row[1] != tissue and other.reaches(high)]
-    if overlapping:
+    if overlapping and high.interval is not None:
         told += f" It may be as large in {' and '.join(overlapping)}, as the intervals overlap."
     if beside.floor is not None:
         told += f" The noise floor is {beside.floor.max_shear_p50:.3f} and {beside.floor.max_shear_p95:.3f}."
@@ -100,5 +100,5 @@ def table_of_loads(measured: Sequence[Section]) -> Table | None:
     note = _NOTE.format(_INTERVALS if known else "")
     bare = [str(row[1]) for row in rows if isinstance(row[3], Estimate) and row[3].interval is None]
     if known and bare:
-        note += f" No interval in {' and '.join(dict.fromkeys(bare))}: the registration of the load gives the reason."
+        note += f" No interval is known in {' and '.join(dict.fromkeys(bare))}."
     return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, note)

@@ -113,6 +113,8 @@ def test_the_most_strained_tissue_is_surely_so() -> None:
     assert "is fat under Load1" in most_strained(Table("Measured", columns, (rows[1], below_zero)))[0]
     apart = ("Load1", "muscle", fat[0], Estimate(0.3, (0.2, 0.399)))
     assert "as large" not in most_strained(Table("Measured", columns, (rows[1], apart)))[0]
+    unknown = ("Load1", "fat", Estimate(0.3), Estimate(0.41)), rows[0]
+    assert "as large" not in most_strained(Table("Measured", columns, unknown))[0]
     (alone,) = most_strained(Table("Measured", columns, (("Load1", "soft tissue", *fat),)))
     assert alone.startswith("Soft tissue under Load1: measured maximum shear strain 0.300")
     alike = {"fat": 0.4195, "skin": 0.4202}  # 0.420 in the table
