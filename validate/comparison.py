@@ -32,7 +32,7 @@ from dvc.worker import Each
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
 from validate.comparison_error import ComparisonError
-from validate.curves import Area
+from validate.curves import Area, range_told
 from validate.decomposition import Representation
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
@@ -103,7 +103,7 @@ class Comparison:
             informative = load not in self.ranking.uninformative
             listed = _listed(ranked, nothing, informative)
             order = "best first" if informative else "not informative"
-            lines.append(f"{load}: area between strain-volume curves, mL, {order}: {listed}")
+            lines.append(f"{load}: {self._area}, mL, {order}: {listed}")
             for name, area in levelled.items():
                 before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
                 lines.append(f"{load}: {name} {area.ml:.2f} by forward-model comparison, {before:.2f} directly")
@@ -121,9 +121,8 @@ class Comparison:
         loads = list(self.coverage_ml)
         columns = [*([ALL_LOADS] if len(loads) > 1 else []), *loads]
         head, rows = ("model", "rank", *columns), tuple(area_rows(self.areas, self.ranking, columns))
-        low, high = self.strains
         interval = " (95 % interval)" if any(np.isfinite(area.low_ml) for area in self.areas) else ""
-        title = f"Area between strain-volume curves, maximum shear strain {low:g} to {high:g}, mL{interval}"
+        title = f"Area between strain-volume curves, {range_told(self.strains)}, mL{interval}"
         picture = Picture("Strain-volume curves", "", png_bytes(self.plot()))
         words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}.", *self.verdict.reasons]
         return notebook_html(self.headline, picture, Table(title, head, rows), notes=words)
@@ -137,10 +136,11 @@ class Comparison:
         best = min(ranked, key=lambda a: a.best_ml)
         nothing = {a.load: a for a in (*self.areas, self.ranking.nothing) if (a.model, a.tissue) == (NOTHING, ALL)}
         worse = ", no better than a model without deformation" if no_nearer([best], nothing[best.load]) else ""
-        return (
-            f"{best.model}: area between strain-volume curves {shown(best)} mL ({best.load}), normalised "
-            f"{100 * best.share:.1f} %{worse}."
-        )
+        return f"{best.model}: {self._area} {shown(best)} mL ({best.load}), normalised {100 * best.share:.1f} %{worse}."
+
+    @property
+    def _area(self) -> str:
+        return f"area between strain-volume curves ({range_told(self.strains)})"
 
     def plot(self, kind: Literal["curves", "areas"] = "curves", *, tissue: str = ALL) -> Figure:
         """Draw strain-volume curves, a panel for each load, or the areas between them with their 95 % intervals.

@@ -41,6 +41,11 @@ def check_range(strains: tuple[float, float]) -> None:
         )
 
 
+def range_told(strains: tuple[float, float]) -> str:
+    """The range of maximum shear strain of an area, in words."""
+    return f"max. shear {strains[0]:g} to {strains[1]:g}"
+
+
 def area_between(
     first: FloatArray, second: FloatArray, volumes_ml: FloatArray, strains: tuple[float, float] = RANGE
 ) -> float:

@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from validate.curves import Area, Band
+from validate.curves import Area, Band, range_told
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, LoadComparison
 from validate.mapping import ALL
@@ -83,7 +83,8 @@ def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ())
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
         caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
         caveat = caveat * bool(distrusted) + _not_trusted(odd)
-        statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat, brief=False))
+        strains = loads[0].criteria.strains
+        statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat, strains))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs, tuple(uninformative))
 
 
@@ -133,27 +134,29 @@ def _under(one: LoadComparison, pairs: Pairs, odd: Sequence[Misfit], brief: bool
     caveat = " The registration of this load has the verdict Do not trust." * distrusted
     caveat += _not_trusted(each for each in odd if each.load == one.load)
     known = ALL in one.bands
-    return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat, brief=brief) if known else ""
+    strains = None if brief else one.criteria.strains
+    return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat, strains) if known else ""
 
 
 def _statement(
-    where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str, *, brief: bool
-) -> str:  # fmt: skip
+    where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str, strains: tuple[float, float] | None
+) -> str:
     """The best model, the models not distinguishable from it, and its area; of a single model, its area.
 
-    A ``brief`` one follows one that says between which curves the area is.
+    Without ``strains``, the range of the area, it follows a statement that says what the area is.
     """
     if not ranked:
         return ""
     best = ranked[0]
     area = f"{best.best_ml:.2f} mL (95 % interval {best.low_ml:.2f} to {best.high_ml:.2f})"
     scale = f"0 mL is perfect agreement, {nothing.best_ml:.2f} mL a model without deformation."
+    over = "" if strains is None else f", {range_told(strains)}"
     if len(ranked) == 1:
-        between = f"Area between the strain-volume curves of {best.model} and the measurement {where}"
+        between = f"Area between the strain-volume curves of {best.model} and the measurement {where}{over}"
         return f"{between}: {area}; {scale}{caveat}"
     near = [b for a, b in pairs if a == best.model]
     of_all = f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other."
-    between = "Area" if brief else "Area between its strain-volume curve and the measured one"
+    between = "Area between its strain-volume curve and the measured one" if over else "Area"
     worse = " It is no better than a model without deformation." * (best.model in no_nearer(ranked, nothing))
     return f"Best match {where} (area metric): {best.model}{of_all} {between}: {area}; {scale}{worse}{caveat}"
 

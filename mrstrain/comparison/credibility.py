@@ -26,6 +26,7 @@ from mrstrain.measurement.acquisition import NOT_GIVEN
 from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.records.provenance import versions
 from validate import ALL, NOTHING, Comparison
+from validate.curves import range_told
 
 TITLE = "Credibility (ASME V&V 40, FDA)"
 """Title of the section of a report."""
@@ -159,7 +160,8 @@ def _areas(held: Holdings, comparison: Comparison) -> str:
         a for a in comparison.areas if a.tissue == ALL and a.model != NOTHING and not a.levelled
     ]
     told = ", ".join(f"{a.model}{driven.get(a.model, '')} {_interval(a.best_ml, a.low_ml, a.high_ml)}" for a in areas)
-    return f"Area between strain-volume curves, mL, with its interval of 95 % coverage: {told}" if told else ""
+    over = range_told(comparison.strains)
+    return f"Area between strain-volume curves ({over}), mL, with its interval of 95 % coverage: {told}" if told else ""
 
 
 def _interval(value: float, low: float, high: float) -> str:

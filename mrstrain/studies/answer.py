@@ -10,16 +10,17 @@ from dvc.errors import InputError
 from dvc.report.page import Picture, Section
 from mrstrain.measurement.answer import NOTHING_BESIDE, MeasuredBeside, most_strained, table_of_loads
 from validate import NOTHING, Comparison
+from validate.curves import range_told
 from validate.load_comparison import STRAINED
 
 _AREAS = "Areas of all models and loads"
 _NEAREST = (
-    " Best match: the model with the smallest area between its strain-volume curve and the measured one in that tissue "
-    "alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, so another "
-    "model may be best. In brackets: other models that are better than no deformation and may be as good, since their "
-    "95 % intervals overlap with that of the best match, or are not known; no significance test is made for a single "
-    "tissue. None: no model is better than no deformation. A dash: hardly any of this tissue is strained (less than "
-    "1 % above {low:g}), so its areas are not informative."
+    " Best match: the model with the smallest area between its strain-volume curve and the measured one ({range}) in "
+    "that tissue alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, "
+    "so another model may be best. In brackets: other models that are better than no deformation and may be as good, "
+    "since their 95 % intervals overlap with that of the best match, or are not known; no significance test is made "
+    "for a single tissue. None: no model is better than no deformation. A dash: hardly any of this tissue is strained"
+    " (less than 1 % above {low:g}), so its areas are not informative."
 )
 
 
@@ -45,7 +46,7 @@ def answer_of(
     if comparison is not None:
         nearest = _nearest(comparison)
         rows = tuple((*row, nearest.get((str(row[0]), str(row[1])), "–")) for row in table.rows)
-        note = table.note + _NEAREST.format(low=comparison.strains[0])
+        note = table.note + _NEAREST.format(low=comparison.strains[0], range=range_told(comparison.strains))
         table = replace(table, columns=(*table.columns, "best match"), rows=rows, note=note)
     paragraphs = (*words, *compared[0].paragraphs)
     first = replace(compared[0], tables=(table,), paragraphs=paragraphs)

@@ -84,7 +84,8 @@ def test_what_is_read_back_is_what_was_written(comparison: Comparison, folder: P
         assert getattr(back, same) == getattr(comparison, same), same
     assert str(back) == str(comparison)
     assert str(back).startswith(
-        "Verdict on the inputs: Use with care\nLoad1: area between strain-volume curves, mL, best first: "
+        "Verdict on the inputs: Use with care\n"
+        "Load1: area between strain-volume curves (max. shear 0.2 to 0.5), mL, best first: "
     )
     assert "half is linear." in str(back)
     assert back._repr_html_().partition("<img")[0] == comparison._repr_html_().partition("<img")[0]
@@ -171,7 +172,8 @@ def test_the_headline_is_the_best_match_or_the_area_of_the_best(comparison: Comp
     ranking = replace(comparison.ranking, statements=(doubt, best_match))
     assert comparison.headline == replace(comparison, ranking=ranking).headline == best_match
     without = replace(comparison, ranking=replace(comparison.ranking, statements=(doubt,)))
-    assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: area between strain-volume curves ")
+    over = "area between strain-volume curves (max. shear 0.2 to 0.5) "
+    assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: {over}")
 
 
 def test_a_load_whose_area_is_not_informative_has_no_best_model(comparison: Comparison) -> None:
