@@ -33,6 +33,7 @@ class ErrorBars:
     model: ErrorModel | None = None  # with the one table that was used
     twin: tuple[Judged, ...] = ()  # how the shear came back from the pair's twin, by tissue
     of_twin: str = ""  # what that did to the error bars
+    beyond: str = ""  # how far the images are from those of the error model, if they are far
 
     @property
     def sigma(self) -> Float32Array | None:
@@ -62,13 +63,14 @@ class ErrorBars:
             told = {"known": True, "source": self.explanation, "voxel_mm": voxel, "snr": snr}
         if self.twin or self.of_twin:
             told |= {"twin": [asdict(row) for row in self.twin], "of_twin": self.of_twin}
-        return told
+        return told | ({"beyond": self.beyond} if self.beyond else {})
 
     @classmethod
     def from_dict(cls, told: Mapping[str, Any], uncertainty: Uncertainty | None, model: ErrorModel | None) -> Self:
         """The error bars that `as_dict` gave, with their arrays."""
         twin = tuple(Judged(**row) for row in told.get("twin", ()))
-        return cls(uncertainty, str(told.get("source", told.get("reason", ""))), model, twin, told.get("of_twin", ""))
+        words = str(told.get("source", told.get("reason", "")))
+        return cls(uncertainty, words, model, twin, told.get("of_twin", ""), told.get("beyond", ""))
 
     def draws(self, maps: StrainMaps, count: int, seed: int) -> Iterator[TrueField]:
         """Draw true fields of a measurement, one after the other; InputError where its errors are not known."""
@@ -122,8 +124,9 @@ class ErrorBars:
 
     @property
     def summary(self) -> list[str]:
-        """Why there are none, if images were registered, and what the twin did to them, in lines."""
+        """Why there are none, if images were registered; whether they are far from their images; the twin; in lines."""
         lines = [f"No error bars: {self.explanation}"] * bool(self.uncertainty is None and self.explanation)
+        lines += [self.beyond] * bool(self.beyond)
         return lines + [f"Error bars: {self.of_twin}"] * bool(self.of_twin)
 
 
@@ -152,7 +155,8 @@ def error_bars(
     bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
     try:
         chosen = _model_for(found, model)
-        table = chosen.table_for(larger, min(one.snr for one in found.noise if one is not None))
+        snr = min(one.snr for one in found.noise if one is not None)
+        table = chosen.table_for(larger, snr)
         if not bone.any():
             raise InputError("The error model needs the distance to bone, but no bone was given.")
     except InputError as reason:
@@ -178,7 +182,8 @@ def error_bars(
         "that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
     )
     told = " ".join((told, *gaps))
-    return ErrorBars(sure, told, _used(chosen, table, wider), rows, _of_twin(rows, twin))
+    used, beyond = _used(chosen, table, wider), table.beyond(larger, snr)
+    return ErrorBars(sure, told, used, rows, _of_twin(rows, twin), beyond)
 
 
 def _wider(rows: Sequence[Judged]) -> dict[str, float]:

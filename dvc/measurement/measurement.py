@@ -332,8 +332,9 @@ class Measurement:
         tables += [*([] if self.is_repeat else weights), *page.error_tables(bars)]
         others = [picture for stem, picture in pictures.items() if stem not in ("strain", "curves", "checkerboard")]
         shown = pictures["strain"], pictures["curves"], *others
-        short = page.summary_table(self.regions, self.intervals)
-        return Section(self.name, self.verdict, tuple(tables), shown, pictures_first=True, summary=short)
+        short = page.summary_table(self.regions, self.intervals, bars.beyond)
+        part = Section(self.name, self.verdict, tuple(tables), shown, pictures_first=True, summary=short)
+        return replace(part, caveat=bars.beyond)
 
     def drawings(self) -> dict[str, Drawing]:
         """The figures of a report, by the name of their files; InputError for one that was read from a folder."""

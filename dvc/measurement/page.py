@@ -14,7 +14,7 @@ from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
 from dvc.report.drawing import Columns, Drawing
-from dvc.report.page import Cell, Estimate, Table
+from dvc.report.page import LOPSIDED, Cell, Estimate, Table
 from dvc.report.sheet import View
 from dvc.trust.components import ComponentUncertainty
 from dvc.trust.quality import NoiseFloor, Quality
@@ -156,8 +156,11 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
     return Table("Maximum shear strain by region", columns, rows, note)
 
 
-def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
-    """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known."""
+def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval], caveat: str = "") -> Table:
+    """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known.
+
+    The ``caveat``, a sentence on the intervals, stands in its note.
+    """
     known = {(i.region, i.statistic): (i.low, i.high) for i in intervals if not np.isnan(i.low)}
 
     def cells(r: RegionRow) -> tuple[Cell, ...]:
@@ -165,9 +168,10 @@ def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -
         return r.region, Estimate(r.median, median), Estimate(r.p95, high)
 
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
-    note = "In brackets: interval of 95 % coverage, from the error model." if known else ""
+    note = f"In brackets: interval of 95 % coverage, from the error model. {LOPSIDED}" if known else ""
     if bare := dict.fromkeys(i.region for i in intervals if np.isnan(i.low)):
-        note = f"{note} No interval in {', '.join(bare)}: its coverage is known to be below 90 %.".strip()
+        note = f"{note} No interval in {', '.join(bare)}: its coverage is known to be below 90 %."
+    note = f"{note} {caveat}".strip()
     return Table("Maximum shear strain by tissue", ("tissue", "median", "95th percentile"), rows, note)
 
 

@@ -41,6 +41,11 @@ NIIVUE = "0.69.0"
 """Version of the viewer (WebGL 2, niivue.com) that comes with the package; it draws what the page itself holds."""
 MEASUREMENT, WITH_MODELS = "Measurement", "Measurement and model files"
 """What a verdict is on: the measurement, or also the files of models, where there is something odd in them."""
+LOPSIDED = (
+    "An interval is not centred on the measured value, because the bias is removed from it: noise raises low strains, "
+    "and smoothing lowers peaks."
+)
+"""In the note of a table with intervals of a measured strain."""
 METHODS = "Methods text"
 """Title of a report's section with paragraphs for a methods section."""
 
@@ -215,6 +220,7 @@ class Section:
     folded: bool = False
     pictures_first: bool = False  # before the tables, and before all but the first two paragraphs
     summary: Table | None = None  # its first table, which a report of many sections also begins with
+    caveat: str = ""  # a sentence in the note of that table, which stands below that beginning, too
 
 
 def shown(value: Cell) -> str:

@@ -33,6 +33,7 @@ component of the displacement, mm. The components' values are the same in all ax
 _FORMAT = 2
 _FORMER = 1  # without components
 _FAR = 1.6  # a table is used for voxels and noise within this factor of its own
+_BEYOND = 1.2  # beyond this factor, readers of the error bars are told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +81,20 @@ class ErrorTable:
         """Whether errors of the components of strain and displacement are known."""
         return len(self.whole[POOLED]) == len(ROWS)
 
+    def far(self, spacing_mm: FloatArray, snr: float) -> float:
+        """The factor between its voxel's edges or SNR and those of images, whichever is largest; 1 or more."""
+        voxel = np.abs(np.log(np.sort(spacing_mm) / np.sort(self.spacing_mm))).max()
+        return float(np.exp(max(voxel, abs(np.log(snr / self.snr)))))
+
+    def beyond(self, spacing_mm: FloatArray, snr: float) -> str:
+        """A sentence if voxels (3,) mm or SNR of images differ from its own by more than a factor of 1.2."""
+        if self.far(spacing_mm, snr) <= _BEYOND:
+            return ""
+        return (
+            f"The error bars are those of voxels of {_told(self.spacing_mm)} mm at SNR {self.snr:.0f}; these images "
+            f"have {_told(spacing_mm)} mm and SNR {snr:.0f}, so the error bars are less certain."
+        )
+
     def expected(
         self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None = None
     ) -> tuple[FloatArray, FloatArray]:
@@ -125,14 +140,8 @@ class ErrorModel:
 
         InputError if no table is that close; the message gives the closest.
         """
-        edges = np.sort(spacing_mm)
-
-        def far(table: ErrorTable) -> float:
-            voxel = np.abs(np.log(edges / np.sort(table.spacing_mm))).max()
-            return float(max(voxel, abs(np.log(snr / table.snr))))
-
-        nearest = min(self.tables, key=far)
-        if not far(nearest) <= np.log(_FAR):
+        nearest = min(self.tables, key=lambda table: table.far(spacing_mm, snr))
+        if not nearest.far(spacing_mm, snr) <= _FAR:
             raise InputError(
                 f"The error of {self.preset} is not known for voxels of {_told(spacing_mm)} mm at SNR {snr:.0f}: the "
                 f"closest known, {_told(nearest.spacing_mm)} mm at SNR {nearest.snr:.0f}, is too far. Measure it with "

@@ -10,7 +10,8 @@ from dvc import Subject
 from dvc.errors import InputError
 from dvc.io.result_folder import QUALITY
 from dvc.measurement.subject import is_bones_name
-from dvc.report.page import Estimate, Section, Table
+from dvc.report.alike import alike
+from dvc.report.page import LOPSIDED, Estimate, Section, Table
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
@@ -97,8 +98,12 @@ def table_of_loads(measured: Sequence[Section]) -> Table | None:
         return None
     rows = tuple((load, *row) for load, of in tables for row in of.rows if not is_bones_name(str(row[0])))
     known = any(of.note for _, of in tables)
-    note = _NOTE.format(_INTERVALS if known else "")
+    note = _NOTE.format(_INTERVALS if known else "") + f" {LOPSIDED}" * known
     bare = [str(row[1]) for row in rows if isinstance(row[3], Estimate) and row[3].interval is None]
     if known and bare:
         note += f" No interval is known in {' and '.join(dict.fromkeys(bare))}."
+    caveats = [(section.title, section.caveat) for section in measured if section.summary is not None]
+    if len({caveat for _, caveat in caveats}) > 1:
+        caveats = [("", one) for one in alike(f"{load}: {caveat}" for load, caveat in caveats if caveat)]
+    note = " ".join((note, *dict.fromkeys(caveat for _, caveat in caveats if caveat)))
     return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, note)

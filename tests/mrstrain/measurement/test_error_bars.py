@@ -14,9 +14,9 @@ from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.images.noise import noise_of, signal_to_noise
 from dvc.images.tissue import widened
-from dvc.measurement.error_bars import TwinCheck, error_bars
+from dvc.measurement.error_bars import ErrorBars, TwinCheck, error_bars
 from dvc.measurement.judgement import with_caution
-from dvc.measurement.page import error_tables
+from dvc.measurement.page import error_tables, summary_table
 from dvc.measurement.subject import LabelsFromImage, Subject
 from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import load_preset
@@ -133,6 +133,27 @@ def test_a_model_of_other_voxels_says_so() -> None:
     tables = [replace(t, spacing_mm=tuple(1.3 * edge for edge in t.spacing_mm)) for t in model().tables]
     told = bars_of(found, subject, maps, replace(model(), tables=tuple(tables))).explanation
     assert f"(these images: voxels of {own} mm)" in told
+
+
+@pytest.mark.parametrize(
+    ("voxel", "snr", "far"), [(1.0, 25.0, False), (1.15, 27.0, False), (1.3, 25.0, True), (1.0, 33.0, True)]
+)
+def test_images_that_are_far_from_those_of_the_error_model_are_told_of_with_the_error_bars(
+    voxel: float, snr: float, far: bool
+) -> None:
+    found, subject, maps = given()
+    tables = [replace(t, spacing_mm=voxel * t.spacing_mm, snr=snr) for t in model().tables]
+    bars = bars_of(found, subject, maps, replace(model(), tables=tuple(tables)))
+    assert ErrorBars.from_dict(bars.as_dict(), bars.uncertainty, bars.model).beyond == bars.beyond
+    assert bars.summary == [bars.beyond] * far
+    assert summary_table([], (), bars.beyond).note.endswith(bars.beyond)
+    assert bool(bars.beyond) == far
+    if far:
+        own, snr_found = f"{0.8 * voxel:.2g}", round(min(one.snr for one in found.noise))
+        assert bars.beyond == (
+            f"The error bars are those of voxels of {own} mm at SNR {snr:.0f}; these images have 0.8 mm and SNR "
+            f"{snr_found}, so the error bars are less certain."
+        )
 
 
 def test_the_noisier_image_counts() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dvc.measurement.page import summary_table
-from dvc.report.page import Estimate, Section, Table
+from dvc.report.page import LOPSIDED, Estimate, Section, Table
 from dvc.trust.quality import NoiseFloor
 from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
@@ -139,6 +139,23 @@ def test_intervals_are_told_of_only_where_there_are_any(tmp_path: Path) -> None:
     without = Section("Load1", summary=summary_table([BONE, FAT], []))
     notes = [answer_of([one], [], tmp_path)[0].tables[0].note for one in (section("Load1"), without)]
     assert ["95 %" in note for note in notes] == [True, False]
+    assert [LOPSIDED in note for note in notes] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("told", "ends"),
+    [
+        (("", ""), LOPSIDED),
+        (("Far.", "Far."), "Far."),
+        (("Far.", ""), "Load1: Far."),
+        (("Far.", "Farther."), "Load1: Far. Load2: Farther."),
+    ],
+)
+def test_what_makes_intervals_less_certain_stands_below_them(told: tuple[str, str], ends: str, tmp_path: Path) -> None:
+    loads = [replace(section(f"Load{n}"), caveat=caveat) for n, caveat in enumerate(told, start=1)]
+    note = answer_of(loads, [], tmp_path)[0].tables[0].note
+    assert note.endswith(f" {ends}")
+    assert note.count("Far.") == ends.count("Far.")
 
 
 def test_registrations_alone_and_a_comparison_alone_are_shown_too(folder: Path, tmp_path: Path) -> None:
