@@ -156,7 +156,7 @@ def _statement(
         return f"{between}: {area}; {scale}{caveat}"
     near = [b for a, b in pairs if a == best.model]
     of_all = f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other."
-    between = "Area between its strain-volume curve and the measured one" if over else "Area"
+    between = f"Area between its strain-volume curve and the measured one{over}" if over else "Area"
     worse = " It is no better than a model without deformation." * (best.model in no_nearer(ranked, nothing))
     return f"Best match {where} (area metric): {best.model}{of_all} {between}: {area}; {scale}{worse}{caveat}"
 

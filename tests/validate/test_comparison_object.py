@@ -85,7 +85,7 @@ def test_what_is_read_back_is_what_was_written(comparison: Comparison, folder: P
     assert str(back) == str(comparison)
     assert str(back).startswith(
         "Verdict on the inputs: Use with care\n"
-        "Load1: area between strain-volume curves (max. shear 0.2 to 0.5), mL, best first: "
+        "Load1: area between strain-volume curves (max. shear 0.05 to 0.5), mL, best first: "
     )
     assert "half is linear." in str(back)
     assert back._repr_html_().partition("<img")[0] == comparison._repr_html_().partition("<img")[0]
@@ -172,7 +172,7 @@ def test_the_headline_is_the_best_match_or_the_area_of_the_best(comparison: Comp
     ranking = replace(comparison.ranking, statements=(doubt, best_match))
     assert comparison.headline == replace(comparison, ranking=ranking).headline == best_match
     without = replace(comparison, ranking=replace(comparison.ranking, statements=(doubt,)))
-    over = "area between strain-volume curves (max. shear 0.2 to 0.5) "
+    over = "area between strain-volume curves (max. shear 0.05 to 0.5) "
     assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: {over}")
 
 

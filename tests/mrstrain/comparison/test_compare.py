@@ -280,7 +280,7 @@ def test_the_command_takes_one_load_and_one_file(study: Path, monkeypatch: pytes
     argv += ["--names", study / "tissues.csv", "--out", out, "--strains", "0.1", "0.4"]
     ran = CliRunner().invoke(app, [str(a) for a in argv])
     assert ran.exit_code == 0, ran.output
-    assert "Load1: area between strain-volume curves (max. shear 0.2 to 0.5), mL, best first: half" in ran.output
+    assert "Load1: area between strain-volume curves (max. shear 0.1 to 0.4), mL, best first: half" in ran.output
     assert (out / "report.html").is_file()
 
 
