@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from dvc import LabelMap, TetMesh, Verdict
 from dvc.arguments import checked
+from dvc.arrays import FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.file_names import clash
 from dvc.mesh import box_told, repeated_rows
@@ -25,6 +27,7 @@ _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
 _FAR_MM = 50.0  # no plate that presses soft tissue moves the bone so far: a seat sinks into a buttock by 2 to 4 cm
 _ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 _SAME_PLACE_MM = 1e-6
+_RIGID_SHARE = 0.1  # of a displacement, what it has beside a rigid motion if that is all that there is to it
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +175,22 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
     return [Misfit("", result.name, f"{result.name}: {told}", level) for level, of in levels.items() for told in of]
 
 
+def _strains_alike(points: FloatArray, weight: FloatArray, u: FloatArray, v: FloatArray, turned: FloatArray) -> bool:
+    """Whether ``u`` agrees with ``turned`` better than with ``v`` where the rigid motion of each is removed."""
+
+    def left(w: FloatArray) -> FloatArray:
+        before, after = points - weight @ points, points + w - weight @ (points + w)
+        rotation, _ = Rotation.align_vectors(after, before, weight)
+        return np.sqrt(weight)[:, None] * (after - rotation.apply(before))
+
+    of_measured, as_stored, as_turned = map(left, (u, v, turned))
+    for whole, part in ((u, of_measured), (v, as_stored)):
+        if np.linalg.norm(part) <= _RIGID_SHARE * np.sqrt(weight @ (whole**2).sum(axis=1)):
+            return False
+    stored, other = ((of_measured * of).sum() / np.linalg.norm(of) for of in (as_stored, as_turned))
+    return bool(other > stored)
+
+
 def displacement_slip(fields: MappedFields, name: str) -> str:
     """A sentence if a model's displacement fits the measured one only with other axes, another frame or another unit.
 
@@ -184,6 +203,11 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
     volume. An error is reported if one of the 48 orders and signs of the components reaches 0.7 and the components as
     stored have less than half of that. A changed sign or order that hardly affects the displacement is not reported. A
     wrong unit is reported if |v| / |u| is closer to 1000 or 1/1000 than to 1.
+
+    A rigid motion in the model, such as that of the plate or of the bone, lies along axes of its own, and another order
+    or sign may turn it towards the measured displacement. Other axes are therefore only named if, without the nearest
+    rigid motion of each, u and v also agree better with them than as stored, and if more than a tenth of each is left.
+    Otherwise the rigid motion is named.
     """
     where = fields.common
     weight = fields.volumes_ml[where] / fields.volumes_ml[where].sum()
@@ -199,9 +223,15 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
         for signs in product((1.0, -1.0), repeat=3)
     }
     most = max(cosines.values())
-    if most >= _ALONG and as_given < _TURNED * most:
-        tied = (axes for axes, cosine in cosines.items() if cosine > most - _TIED)
-        order, signs = min(tied, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
+    tied = (axes for axes, cosine in cosines.items() if cosine > most - _TIED)
+    order, signs = min(tied, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
+    turned = most >= _ALONG and as_given < _TURNED * most
+    if turned and not _strains_alike(fields.points_mm[where], weight, u, v, v[:, order] * signs):
+        warnings.append(
+            f"differs in direction from the measured one (cosine {as_given:z.2f}) by a rigid motion, not by its axes; "
+            "remove the rigid motion of the bone from the model"
+        )
+    elif turned:
         axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
         axes += " (LPS and RAS exchanged)" if axes == "-x -y z" else ""
         warnings.append(

@@ -7,6 +7,7 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dvc.deformation.protocol import Affine
 from dvc.errors import ExtentError, GeometryError
@@ -68,6 +69,30 @@ def test_a_slip_of_axes_frame_or_unit_is_named_under_a_small_load() -> None:
     both = told(found, 1e-3 * rough[:, [1, 0, 2]])
     assert "components as y x z" in both
     assert "in metres" in both
+
+
+@pytest.mark.parametrize("along", [(0.0, 0.0, 3.0), (0.0, 2.0, -2.0), (0.3, 0.0, 0.1)])
+@pytest.mark.parametrize("angle", [0.0, 0.1])
+def test_a_rigid_motion_in_the_model_is_not_taken_for_other_axes(along: tuple[float, ...], angle: float) -> None:
+    found = pressed()
+    right, middle = found.measured.u_mm, found.points_mm.mean(axis=0)
+    rotation = Rotation.from_rotvec([0.0, 0.0, angle])
+
+    def carried(u: np.ndarray) -> np.ndarray:
+        return rotation.apply(found.points_mm + u - middle) + middle + along - found.points_mm
+
+    for stiffness in (0.5, 1.0):
+        assert "components as" not in told(found, carried(stiffness * right))
+    assert "components as" not in told(found, carried(0.0 * right))
+    assert "components as" not in told(replace(found, measured=moved(found, carried(0.0 * right))), right)
+
+
+def test_a_rigid_motion_across_the_measured_one_is_named() -> None:
+    found = pressed()
+    assert told(found, found.measured.u_mm + np.array([0.0, 0.0, 3.0])) == (
+        "model: the displacement differs in direction from the measured one (cosine 0.12) by a rigid motion, not by "
+        "its axes; remove the rigid motion of the bone from the model."
+    )
 
 
 @pytest.mark.parametrize("factor", [0.15, 0.5, 2.0, 9.0])
