@@ -43,13 +43,14 @@ from mrstrain.records.durations import LABELS, REPORT, registrations
 from mrstrain.records.inputs import (
     alone,
     case_names,
+    earlier_results,
     output_folder,
     read_subject,
     refuse_small_disk,
     refuse_touching_inputs,
 )
 from mrstrain.records.outcome import with_reasons
-from mrstrain.records.progress import OnProgress, expect
+from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.time_left import FAILED, WRITING
 
 _log = logging.getLogger(__name__)
@@ -149,6 +150,8 @@ def register(
         more |= scans_record((load0, subject.reference), scans_of)
         record = record_of(subject, files, settings, registration, more)
         plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
+        if earlier := earlier_results(target, cases):
+            tell(NOTE, earlier, 0.0)
         run = _Run(target, plan, images, start, tell)
         if not of_labels:
             _hold(target, stack)

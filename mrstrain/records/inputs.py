@@ -12,10 +12,10 @@ from filelock import FileLock, Timeout
 from dvc import Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import remove_partial
-from dvc.errors import InputError, OutputError
+from dvc.errors import InputError, OutputError, few
 from dvc.file_names import clash, is_utf8, refuse_as_file_name
 from dvc.io.images.write import refuse_overwriting_inputs
-from dvc.io.result_folder import REPORT
+from dvc.io.result_folder import QUALITY, REPORT
 from dvc.measurement.subject import LabelsFromImage, plate_directions
 from dvc.mesh import box_told
 from dvc.own_files import read_json
@@ -135,6 +135,15 @@ def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Seque
                 raise OutputError(
                     f"{out / case} would be replaced, but it has the input {path}. Choose another folder (out)."
                 )
+
+
+def earlier_results(out: Path, case_folders: Sequence[str]) -> str:
+    """A sentence on what an earlier run left in an output folder, replaced or not; empty without results."""
+    found = sorted({path.parent.name for path in out.glob(f"*/{QUALITY}")})
+    replaced, kept = ([name for name in found if (name in case_folders) == these] for these in (True, False))
+    told = [f"results of an earlier run are replaced: {few(replaced)}"] if replaced else []
+    told += [f"results of an earlier run stay: {few(kept)}"] if kept else []
+    return f"{out}: {'; '.join(told)}." if told else ""
 
 
 def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") -> None:

@@ -112,6 +112,28 @@ def test_each_load_of_a_chain_starts_from_the_last_good_one(spy, scans, tmp_path
     assert begun_at["Load3"] is (spy.found["Load2"] if chain else None)
 
 
+def test_results_of_an_earlier_run_are_not_replaced_in_silence(spy, scans, tmp_path):
+    loads, notes = [scans / f"{name}.nii.gz" for name in ("Load1", "Load2")], list[str]()
+
+    def told(case: str, stage: str, _: float) -> None:
+        notes.extend([stage] * (case == "note"))
+
+    def registered() -> list[str]:
+        notes.clear()
+        register(scans / "Load0.nii.gz", loads, out=tmp_path, bone=scans / "bone.nii.gz", workers=1, progress=told)
+        return list(notes)
+
+    assert registered() == []
+    for name in ("Load1", "Old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "quality.json").write_text("{}")
+    assert registered() == [
+        f"{tmp_path}: results of an earlier run are replaced: Load1; results of an earlier run stay: Old."
+    ]
+    shutil.rmtree(tmp_path / "Load1")
+    assert registered() == [f"{tmp_path}: results of an earlier run stay: Old."]
+
+
 def test_where_no_load_is_registered_no_folder_is_left(spy, scans, tmp_path):
     given = {"bone": scans / "bone.nii.gz", "workers": 1}
     with pytest.raises(RegistrationError, match="turned"):
