@@ -110,6 +110,8 @@ def simulate(
         for problem in fe.problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, simulation.element)
     ]
     notes = [note for one in chosen for note in one.for_regions(read.regions)[1]]
+    if assumed := plate_options.assumed("give plate_normal (--plate-normal)") * (len(towards) < len(loads)):
+        tell(NOTE, assumed, 0.0)
     for note in dict.fromkeys([*notes, *(note for _, problem in jobs for note in problem.notes)]):
         tell(NOTE, note, 0.0)
     refuse_touching_inputs(target, [one.name for one in chosen], [place])

@@ -74,15 +74,25 @@ class MeshCoordinates(Options):
     """Frame of the mesh coordinates."""
 
 
+INFERIOR = (0.0, 0.0, -1.0)
+"""Direction from the body to the plate that is assumed, LPS."""
+
+
 class Directions(Options):
     """Where the plate lies, and where it shears."""
 
     panel: ClassVar[str] = "Model"
 
-    plate_normal: Vector = (0.0, 0.0, -1.0)
+    plate_normal: Vector = INFERIOR
     """Direction from the body to the plate, in LPS (x left, y posterior, z superior). Default: 0 0 -1 (inferior)."""
     shear_direction: Vector = (0.0, -1.0, 0.0)
     """Direction of the shear force on the tissue, LPS. Default: 0 -1 0 (anterior)."""
+
+    def assumed(self, instead: str) -> str:
+        """A sentence if the plate lies where it does by default, with what to give ``instead``; empty otherwise."""
+        if self.plate_normal != INFERIOR:
+            return ""
+        return f"The plate is taken to be inferior to the body (normal 0 0 -1, LPS). If it lies elsewhere, {instead}."
 
 
 class ComparisonDirections(Options):

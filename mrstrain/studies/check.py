@@ -96,6 +96,9 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     planned, next_step = looked.tried(plan, told), ""
     if planned is not None and not looked.wrong:  # else only what is wrong counts
         looked.at_report_details()
+        assumed = told.plate.assumed("change normal in [plate] of the study file")
+        if assumed and told.models.sets and not all(load.plate_normal for load in told.loads.values()):
+            looked.notes.append(assumed)
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
         if left:
             lines, warnings = costs(told, planned, left, *sizes_of(told), in_parallel(workers))

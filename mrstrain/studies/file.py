@@ -119,7 +119,7 @@ class Load(_Part):
 class Plate(modelling.PlateOptions):
     """The plate."""
 
-    plate_normal: Vector = Field(default=(0.0, 0.0, -1.0), validation_alias="normal")
+    plate_normal: Vector = Field(default=modelling.INFERIOR, validation_alias="normal")
     """Direction from the body to the plate, LPS (x left, y posterior, z superior)."""
 
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from dvc.deformation.strain import StrainField
-from dvc.errors import InputError
+from dvc.errors import InputError, OutputError
 from dvc.mesh import TetMesh
 from dvc.own_files import read_rows
 from fe import LoadStep, Plate, Problem, paths_of, published_names, read_tet_mesh, write_tet_mesh
@@ -318,6 +319,29 @@ def test_a_load_may_go_in_directions_of_its_own(mesh_file: Path, tmp_path: Path)
     assert np.array(told["forth"]["plate_axes_lps"])[:, 1].tolist() == [0.0, 1.0, 0.0]
     with pytest.raises(InputError, match="Load9, which is no load; the loads are "):
         run(mesh_file, out=tmp_path / "no", loads=loads, **plate, towards={"Load9": aside})
+
+
+def test_a_plate_that_nobody_placed_is_said_to_be_inferior(tmp_path: Path) -> None:
+    place, load, notes = tmp_path / "luboz" / "dome.vtu", LoadStep("Load1", 2.0), list[str]()
+    place.parent.mkdir()
+    write_tet_mesh(place, dome((3, 4, 4)), {})
+
+    def told(case: str, stage: str, _: float) -> None:
+        notes.extend([stage] * (case == "note"))
+
+    def simulated(**more: Any) -> list[str]:
+        notes.clear()
+        with pytest.raises(OutputError):  # the mesh would be replaced; the plate is told before
+            run(place, out=tmp_path, sets=["luboz"], loads=[load], progress=told, **more)
+        return [note for note in notes if "plate" in note]
+
+    inferior = (
+        "The plate is taken to be inferior to the body (normal 0 0 -1, LPS). If it lies elsewhere, give plate_normal "
+        "(--plate-normal)."
+    )
+    assert simulated() == [inferior]
+    assert simulated(plate_normal=DOWN) == []
+    assert simulated(towards={"Load1": (DOWN, (0.0, 1.0, 0.0))}) == []
 
 
 def test_the_dashed_line_lies_on_the_tissue_that_a_plate_from_elsewhere_presses() -> None:

@@ -132,6 +132,23 @@ def test_details_that_nobody_must_give_are_one_note_and_no_problem(study):
     assert not any("No problems found" in line for line in ill.summary())
 
 
+def test_a_plate_that_nobody_placed_is_said_to_be_inferior(study):
+    def told(*changes: tuple[str, str]) -> list[str]:
+        assert wrong(study, ('"mine.toml", ', ""), *changes) == ""
+        return [note for note in check(study).notes if "plate" in note]
+
+    normal = "normal = [-1.0, 0.0, 0.0]\n"
+    inferior = [
+        "The plate is taken to be inferior to the body (normal 0 0 -1, LPS). If it lies elsewhere, change normal in "
+        "[plate] of the study file."
+    ]
+    assert told() == []
+    assert told((normal, "")) == inferior
+    assert told((normal, "normal = [0.0, 0.0, -1.0]\n")) == inferior  # as `init` writes it for everyone
+    own = "shear_n = 4.0\nplate_normal = [-1.0, 0.0, 0.0]\n"
+    assert told((normal, ""), ("shear_n = 4.0\n", own)) == []
+
+
 def test_warnings_are_counted_where_no_problem_is_found(study):
     values = np.ones(GRID.shape, dtype=np.int64)
     values[:4], values[4:6] = 2, 3
