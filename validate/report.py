@@ -1,7 +1,7 @@
 """The report of a comparison: verdict first, then the table of models and loads, curves, slices and agreement."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from dvc.io.images.read import read_voxels
 from dvc.report.alike import alike
 from dvc.report.drawing import Drawing
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
-from dvc.report.strips import MEASURED, Strip, strain_by_load
+from dvc.report.strips import MEASURED, Strip, narrow_by_load, strain_by_load
 from dvc.trust.verdict import together
 from validate import figures, standards
 from validate.agreement import Agreement, SkinDisplacement
@@ -176,10 +176,11 @@ def drawings_of_all(
     informative = ranking.areas and ALL_LOADS not in ranking.uninformative
     only = sum(not area.levelled for area in ranking.areas) == 1
     best = "the only model" if only else "the best match over all loads" if informative else "a model"
-    note = f"Upper row: measured. Lower row: {model}, {best}. {strips[0].title}, through {strips[0].place}."
+    note = f"Measured, and simulated by {model}, {best}. {strips[0].title}, through {strips[0].place}."
     slices, of_all = (strips, (MEASURED, model)), [curve for curve in curves if curve.tissue == ALL]
+    first = Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note)
     return {
-        "slices_by_load": Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note),
+        "slices_by_load": replace(first, narrow=narrow_by_load(*slices)),
         "curves_by_load": Drawing.of(
             "Strain-volume curves, all soft tissue", figures.curves_by_load, of_all, strains, data=columns_of(of_all)
         ),

@@ -1,6 +1,7 @@
 """The loads of one subject side by side: the first figure of a report on measurements alone."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from dvc.io.result_folder import MAX_SHEAR, read_scalar
 from dvc.measurement.subject import Subject
 from dvc.report.drawing import Drawing
 from dvc.report.sheet import PLANES, View, levelled, window_of
-from dvc.report.strips import MEASURED, Strip, strain_by_load
+from dvc.report.strips import MEASURED, Strip, narrow_by_load, strain_by_load
 
 FIGURE = "slices_by_load"
 """Stem of its files."""
@@ -42,4 +43,5 @@ def measured_by_load(subject: Subject, folders: Mapping[str, Path]) -> Drawing:
         shown = {MEASURED: np.where(soft, page, np.float32(np.nan))}
         strips.append(Strip(load, plane, view.extent_mm(plane), view.title(plane), where, image, outlines, shown))
     note = f"{strips[0].title}, through {where}."
-    return Drawing.of("Maximum shear strain under each load", strain_by_load, strips, (MEASURED,), note=note)
+    drawn = Drawing.of("Maximum shear strain under each load", strain_by_load, strips, (MEASURED,), note=note)
+    return replace(drawn, narrow=narrow_by_load(strips, (MEASURED,)))

@@ -28,7 +28,8 @@ _SETTINGS = Lock()  # matplotlib's are those of all threads
 class Drawing:
     """A figure with its title and caption; ``data`` are the numbers in it that stand in no other file.
 
-    On a page it fades to the figures ``beneath`` it, of the same size, each with its name.
+    On a page it fades to the figures ``beneath`` it, of the same size, each with its name. On a narrow screen a
+    ``narrow`` figure takes its place.
     """
 
     title: str
@@ -36,6 +37,7 @@ class Drawing:
     figure: Figure
     data: Columns | None = None
     beneath: tuple[tuple[str, Figure], ...] = ()
+    narrow: Figure | None = None
 
     @classmethod
     def of(
@@ -47,7 +49,9 @@ class Drawing:
     def save(self, stem: Path) -> Picture:
         """Write its files, as `save_figure`; the picture for a page."""
         png = save_figure(stem, self.figure, self.data)
-        return Picture(self.title, self.caption, png, tuple((name, png_bytes(one)) for name, one in self.beneath))
+        beneath = tuple((name, png_bytes(one)) for name, one in self.beneath)
+        narrow = b"" if self.narrow is None else png_bytes(self.narrow)
+        return Picture(self.title, self.caption, png, beneath, narrow)
 
 
 def save_figure(stem: Path, figure: Figure, data: Columns | None = None) -> bytes:

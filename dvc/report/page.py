@@ -54,13 +54,15 @@ METHODS = "Methods text"
 class Picture:
     """A PNG figure (InputError for another) with what it shows and how to read it.
 
-    A page fades from it to pictures ``beneath`` it, of the same size, each a name with a PNG file's bytes.
+    A page fades from it to pictures ``beneath`` it, of the same size, each a name with a PNG file's bytes. On a narrow
+    screen it shows the picture ``narrow``, if there is one, instead.
     """
 
     title: str
     caption: str
     png: bytes
     beneath: tuple[tuple[str, bytes], ...] = ()
+    narrow: bytes = b""
 
     def __post_init__(self) -> None:
         if not self.png.startswith(_PNG_SIGNATURE):
@@ -77,6 +79,11 @@ class Picture:
         return _small(self.png)
 
     @property
+    def small_narrow(self) -> str:
+        """The picture for a narrow screen, as `small`; empty without one."""
+        return _small(self.narrow) if self.narrow else ""
+
+    @property
     def small_beneath(self) -> list[tuple[str, str]]:
         """The pictures beneath it, each with its name; as `small`."""
         return [(name, _small(png)) for name, png in self.beneath]
@@ -90,7 +97,12 @@ class Picture:
     @property
     def width(self) -> int:
         """Width on the page, CSS pixels."""
-        return round(int.from_bytes(self.png[16:20], "big") * _CSS_PIXELS_PER_DOT)
+        return _width(self.png)
+
+    @property
+    def narrow_width(self) -> int:
+        """Width on the page of the picture for a narrow screen."""
+        return _width(self.narrow)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,6 +284,10 @@ def _line(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
+def _width(png: bytes) -> int:
+    return round(int.from_bytes(png[16:20], "big") * _CSS_PIXELS_PER_DOT)
+
+
 @lru_cache(maxsize=256)
 def _small(png: bytes) -> str:
     """The picture as WebP: as a photograph, or, where that is smaller, a chart in a few colours, which stays sharp."""
@@ -330,7 +346,8 @@ def write_report(
             volumes.setdefault(volume.data, f"volume-{len(volumes) + 1}")
     pictures = [picture for section in (*sections, *closing) for picture in section.pictures]
     with ThreadPoolExecutor(usable_cores()) as pool:  # which the template then finds done
-        list(pool.map(_small, (png for one in pictures for png in (one.png, *(png for _, png in one.beneath)))))
+        each = (png for one in pictures for png in (one.png, one.narrow, *(png for _, png in one.beneath)) if png)
+        list(pool.map(_small, each))
     style, script, library = stored("page.css"), stored("page.js"), _library() if volumes else None
     scripts = [script, library["script"], library["code"]] if library else [script]
     page = template("report", alike=alike, unbroken=unbroken, wrapping=wrapping).render(

@@ -16,10 +16,12 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.report.chart import colour_bar, empty
 from dvc.report.figures import MAX_SHEAR
 from dvc.report.sheet import LETTERS, Plane, name_sides, outline, scale_bar, slice_panel
-from dvc.report.style import FONT, INK, ON_DARK, WIDTH_IN
+from dvc.report.style import FONT, INK, ON_DARK, SMALL, WIDTH_IN
 
 MEASURED = "measured"
 _GAP_IN, _HEAD_IN, _SIDE_IN, _FOOT_IN, _TALLEST_IN = 0.06, 0.3, 0.3, 0.62, 3.2
+_NARROW_IN = 4.2  # width of what a screen of 400 pixels shows
+_SMALL = 0.6  # there, of the size of a slice, the unloaded image
 _COLOURS = colormaps["viridis"]
 
 
@@ -40,10 +42,11 @@ class Strip:
 def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     """Maximum shear strain under each load, in one slice of the unloaded anatomy.
 
-    On the left, the unloaded image, or its label map if there is no image. A anterior, P posterior, S superior, I
+    Load0 is the unloaded image, or its label map if there is no image. A anterior, P posterior, S superior, I
     inferior, R right, L left. White lines are the surfaces of the body and of the bones. Grey: strain is not defined
-    (not measured, or outside the mesh of a model). The colour scale ends at the 98th percentile of all that is shown,
-    rounded up to the next multiple of 0.05.
+    (not measured, or outside the mesh of a model). All slices of this picture have one colour scale, which ends at the
+    98th percentile of all that is shown, rounded up to the next multiple of 0.05; pictures of single loads have scales
+    of their own.
     """
     # A row for each name; they are those of `Strip.max_shear`.
     first, many = strips[0], len(rows) > 1
@@ -57,10 +60,7 @@ def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     figure, norm = empty(size), Normalize(0.0, _highest(strips, rows))
     middle = _FOOT_IN + (len(rows) - 1) * (h + _GAP_IN) / 2
     unloaded = slice_panel(figure, (0.0, middle / size[1], w / size[0], h / size[1]))
-    _paint(unloaded, first, None, norm)
-    unloaded.set_title("Load0", color=INK, pad=4, **FONT)
-    name_sides(unloaded, LETTERS[first.plane], **ON_DARK)
-    scale_bar(unloaded, width_mm, **ON_DARK)
+    _unloaded(unloaded, first, norm)
     for row, name in enumerate(rows):
         low = _FOOT_IN + (len(rows) - 1 - row) * (h + _GAP_IN)
         if many:
@@ -76,6 +76,40 @@ def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     bar = figure.add_axes(((size[0] - length) / 2 / size[0], 0.42 / size[1], length / size[0], 0.12 / size[1]))
     colour_bar(bar, ScalarMappable(norm, _COLOURS), MAX_SHEAR, "max")
     return figure
+
+
+def narrow_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
+    """The slices of `strain_by_load` in two columns, for a narrow screen; the unloaded image is small, and last."""
+    first, many = strips[0], len(rows) > 1
+    shown = [(strip, name) for strip in strips for name in rows]
+    columns = len(rows) if many else 2
+    lines = -(-len(shown) // columns)
+    left, right, bottom, top = first.extent_mm
+    width_mm, height_mm = right - left, abs(top - bottom)
+    inches = min(((_NARROW_IN + _GAP_IN) / columns - _GAP_IN) / width_mm, _TALLEST_IN / height_mm)
+    w, h = inches * width_mm, inches * height_mm
+    foot_in = _HEAD_IN + max(_SMALL * h, _FOOT_IN)
+    size = _NARROW_IN, lines * (h + _HEAD_IN) + foot_in
+    figure, norm = empty(size), Normalize(0.0, _highest(strips, rows))
+    for number, (strip, name) in enumerate(shown):
+        line, column = divmod(number, columns)
+        low = size[1] - (line + 1) * (h + _HEAD_IN)
+        axes = slice_panel(figure, (column * (w + _GAP_IN) / size[0], low / size[1], w / size[0], h / size[1]))
+        _paint(axes, strip, name, norm)
+        axes.set_title(f"{strip.load}, {name}" if many else strip.load, color=INK, pad=4, **SMALL)
+    _unloaded(slice_panel(figure, (0.0, 0.0, _SMALL * w / size[0], _SMALL * h / size[1])), first, norm)
+    at = _SMALL * w + _SIDE_IN
+    bar = figure.add_axes((at / size[0], 0.42 / size[1], (size[0] - at - _SIDE_IN) / size[0], 0.12 / size[1]))
+    colour_bar(bar, ScalarMappable(norm, _COLOURS), "max. shear strain, no unit", "max")
+    return figure
+
+
+def _unloaded(axes: Axes, strip: Strip, norm: Normalize) -> None:
+    """Draw the unloaded image, with letters and a scale bar."""
+    _paint(axes, strip, None, norm)
+    axes.set_title("Load0", color=INK, pad=4, **FONT)
+    name_sides(axes, LETTERS[strip.plane], **ON_DARK)
+    scale_bar(axes, strip.extent_mm[1] - strip.extent_mm[0], **ON_DARK)
 
 
 def _highest(strips: Sequence[Strip], rows: Sequence[str]) -> float:

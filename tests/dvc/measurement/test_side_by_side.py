@@ -59,6 +59,24 @@ def test_each_load_has_its_own_strain_in_soft_tissue_alone(subject: Subject, fol
         np.testing.assert_allclose(page.compressed(), strain, rtol=1e-6)
 
 
+def test_on_a_narrow_screen_the_strains_come_first_in_two_columns(subject: Subject, folders: dict[str, Path]) -> None:
+    drawing = measured_by_load(subject, folders)
+    assert drawing.narrow is not None
+    first, second, unloaded, bar = drawing.narrow.axes
+    assert [axes.get_title() for axes in (first, second, unloaded)] == ["Load1", "Load2", "Load0"]
+    for axes, strain in ((first, 0.05), (second, 0.31)):
+        np.testing.assert_allclose(axes.images[1].get_array().compressed(), strain, rtol=1e-6)
+        assert axes.images[1].norm.vmax == 0.35 == bar.get_xlim()[1]
+    assert len(unloaded.images) == 1
+    left, right, small, below = (axes.get_position() for axes in (first, second, unloaded, bar))
+    assert left.y0 == right.y0 > small.y1
+    assert left.x1 < right.x0
+    assert small.width == pytest.approx(0.6 * left.width)
+    assert small.x1 < below.x0
+    assert max(right.x1, below.x1) <= 1.0
+    assert drawing.narrow.get_size_inches()[0] < 4.5
+
+
 def test_the_slice_has_the_plates_normal_and_its_shear_in_it(subject: Subject, folders: dict[str, Path]) -> None:
     from_the_side = replace(subject, plate_normal=np.array([1.0, 0.0, 0.0]))
     assert "Coronal" in panels(from_the_side, folders)[2]

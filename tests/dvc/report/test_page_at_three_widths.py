@@ -6,6 +6,7 @@ import base64
 import io
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,10 +29,10 @@ SMALLEST_LETTER_PX = f"""Math.min(...[...document.querySelectorAll(".stack img")
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")
 
 
-def wide() -> bytes:
+def wide(width: int = 941, height: int = 360) -> bytes:
     """A picture as wide as most figures, whatever earlier tests have set for figures."""
-    file = io.BytesIO()
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (360, 941, 3), dtype=np.uint8)).save(file, "png")
+    file, pixels = io.BytesIO(), np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(file, "png")
     return file.getvalue()
 
 
@@ -59,6 +60,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Section("Load1", Verdict("trust"), (table,), (picture,), ("What was found.",), summary=table),
         Section("Load2", doubtful, (areas,), folded=True),
         Section("Load3", Verdict("distrust", ("The deformation folds.",)), folded=True),
+        Section("All loads", None, (), (replace(picture, title="All loads", beneath=(), narrow=wide(504, 1000)),)),
         Section("In space", folded=True, viewers=(Viewer("Strain", "To turn.", image, (strain,)),)),
     ]
     path = tmp_path_factory.mktemp("page") / "report.html"
@@ -131,6 +133,29 @@ def test_letters_in_a_picture_are_legible_on_a_telephone_and_it_can_be_seen_whol
     tab.value(f"{BUTTON}.click()")
     assert tab.value(f"{BUTTON}.textContent") == "Show the whole picture"
     assert tab.said == []
+
+
+@pytest.mark.parametrize(
+    ("width", "pixels", "shown"), [(1400, 941, 753), (800, 941, 710), (700, 504, 403), (400, 504, 355)]
+)
+def test_a_picture_that_is_drawn_for_narrow_screens_is_shown_whole_there(
+    tab: Tab, page: Path, width: int, pixels: int, shown: int
+) -> None:
+    opened(tab, page, width)
+    picture = "document.querySelector('picture img')"
+    tab.wait_for(f"{picture}.complete")
+    file = f"""new Promise((read) => {{
+      const one = new Image(); one.onload = () => read(one.width); one.src = {picture}.currentSrc;
+    }})"""
+    assert tab.value(file) == pixels
+    assert tab.value(f"{picture}.getBoundingClientRect().width") == pytest.approx(shown, abs=2)
+    assert tab.value(f"{picture}.alt") == "All loads, All loads: How to read it."
+    assert tab.value(f"{picture}.closest('figure').querySelector('.fit, .sideways')") is None
+    tab.call("Emulation.setEmulatedMedia", media="print")
+    try:  # paper is narrow, but holds the whole row
+        tab.wait_for(f"{file}.then((found) => found === 941)")
+    finally:
+        tab.call("Emulation.setEmulatedMedia", media="")
 
 
 def test_letters_in_a_picture_are_legible_without_scripts(tab: Tab, page: Path) -> None:
