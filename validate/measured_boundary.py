@@ -69,7 +69,7 @@ def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArra
 
 def simulate_driven(
     mesh: TetMesh, materials: Mapping[str, Material], measured: Deformation, load: str, *,
-    threads: int = 1, tell: Callable[[str], None] = lambda _: None,
+    threads: int = 1, tell: Callable[[str], None] = lambda _: None, watch: Callable[[float], None] = lambda _: None,
 ) -> LoadState:  # fmt: skip
     """Equilibrium of a mesh with the measured displacement prescribed on its surface.
 
@@ -83,6 +83,8 @@ def simulate_driven(
         Of tissue relative to its bone, reference configuration, LPS mm.
     threads, tell : int, callable
         Threads of the linear solver; ``tell`` is called with a line for each increment.
+    watch : callable
+        Called with the fraction of the displacement that is reached, 0 to 1.
 
     Raises
     ------
@@ -109,6 +111,7 @@ def simulate_driven(
             state, done, step = converged.state, share, step * _GROWTH
             iterations += converged.iterations
             tell(f"{100 * done:.0f} % of the displacement")
+            watch(done)
     finally:
         solver.close()
     if done == 0.0:

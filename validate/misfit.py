@@ -181,7 +181,7 @@ def _strains_alike(points: FloatArray, weight: FloatArray, u: FloatArray, v: Flo
     def left(w: FloatArray) -> FloatArray:
         before, after = points - weight @ points, points + w - weight @ (points + w)
         rotation, _ = Rotation.align_vectors(after, before, weight)
-        return np.sqrt(weight)[:, None] * (after - rotation.apply(before))
+        return np.asarray(np.sqrt(weight)[:, None] * (after - rotation.apply(before)))
 
     of_measured, as_stored, as_turned = map(left, (u, v, turned))
     for whole, part in ((u, of_measured), (v, as_stored)):

@@ -1,6 +1,5 @@
 """The commands that measure strain, and those that measure its error: phantoms, synthetic warps, their study."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -65,13 +64,7 @@ def label(
         return tell(mrstrain.draw_strokes(load0, out=draw))
     if out is None:
         raise InputError("Give the label map to write: --out tissues.nii.gz (or a page to draw on: --draw page.html).")
-    from mrstrain.records.progress import live
-
-    with live() as progress:
-        done = mrstrain.label.with_options(
-            load0, out=out, masks=masks, strokes=strokes, drawn=drawn, watch=partial(progress, "label", "tissues")
-        )
-    return tell(done)
+    carry_out(mrstrain.label.with_options, load0, out=out, masks=masks, strokes=strokes, drawn=drawn)
 
 
 @takes_options

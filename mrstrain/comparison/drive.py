@@ -1,8 +1,9 @@
 """`drive`: constitutive models under measured (Dirichlet) boundary conditions, without plate, contact and friction."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import fe
@@ -15,14 +16,17 @@ from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
 from mrstrain.models.simulate import material_sets
 from mrstrain.options.door import door
 from mrstrain.options.modelling import MaterialSets, MeshCoordinates
+from mrstrain.records.durations import SIMULATING, driven, driven_part
 from mrstrain.records.inputs import alone, make_output, refuse_touching_inputs
 from mrstrain.records.outcome import Outcome
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import provenance
+from mrstrain.records.time_left import Expected
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
 _log = logging.getLogger(__name__)
 ENDING = "-driven"  # of a set's folder
+_CASE = "drive"
 _BOUNDARY = "boundary"  # folder in it, of the boundary conditions for other codes
 
 
@@ -85,30 +89,43 @@ def drive(
             make_output(folder)
             held_folders.enter_context(alone(folder))
             fe.begin_simulation(folder)
-        for number, (name, (materials, notes)) in enumerate(laws.items()):
-            tell("drive", "simulating", number / len(laws))
+        how_long = driven(chosen, measured, len(read.cells))
+        expect(progress, {_CASE: Expected(how_long.seconds)})
+        tell(_CASE, SIMULATING, 0.0)
+
+        def told(name: str, load: str, done: float) -> None:
+            tell(_CASE, SIMULATING, how_long.share(driven_part(name, load), min(done, 0.99)))  # then it is written
+
+        for name, (materials, notes) in laws.items():
             with whole_folder(folders[name] / _BOUNDARY) as conditions:
                 for load, (nodes, u) in prescribed.items():
                     write_boundary_conditions(conditions / load, read, nodes, u, unit=unit, frame=frame)
-            outcome, messages = _drive_set(folders[name], read, materials, measured, threads or usable_cores())
+            watch = partial(told, name)
+            outcome, messages = _drive_set(folders[name], read, materials, measured, threads or usable_cores(), watch)
             complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
             lines += messages
             about = {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name}
             about |= {"laws": {region: law.description for region, law in materials.items()}, "title": titles[name]}
             write_json(folders[name] / "simulation.json", about | record)
-    tell("drive", "simulating", 1.0)
+    tell(_CASE, SIMULATING, 1.0)
     return Outcome(target, (*lines, f"Results: {target}"), complete)
 
 
 def _drive_set(
-    folder: Path, mesh: TetMesh, laws: Mapping[str, fe.Material], measured: Mapping[str, Deformation], threads: int
+    folder: Path,
+    mesh: TetMesh,
+    laws: Mapping[str, fe.Material],
+    measured: Mapping[str, Deformation],
+    threads: int,
+    watch: Callable[[str, float], None],
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Simulate all loads with one material set and write the results; the outcome of each load, and summary lines."""
     rows, outcome, log, lines = list[fe.RegionFigures](), dict[str, dict[str, float]](), list[str](), list[str]()
     name = folder.name.removesuffix(ENDING)
     for load, field in measured.items():
         try:
-            state = simulate_driven(mesh, laws, field, load, threads=threads, tell=log.append)
+            share = partial(watch, load)
+            state = simulate_driven(mesh, laws, field, load, threads=threads, tell=log.append, watch=share)
         except InputError:
             raise
         except MrstrainError as failure:

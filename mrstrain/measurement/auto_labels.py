@@ -1,6 +1,7 @@
 """Labels "auto" of `register`: when a label map can be made from the unloaded image, how, and who should know of it."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from dvc import Engine
@@ -11,6 +12,7 @@ from dvc.measurement.subject import bones_of
 from dvc.report.page import Section
 from mrstrain.measurement.engines import GAUSS_NEWTON
 from mrstrain.options.measurement import MADE_LABELS, Marks, RegistrationOptions, Scans, SubjectFiles
+from mrstrain.records.durations import TISSUES
 from mrstrain.records.inputs import made_labels
 
 NEXT_STEP = (
@@ -58,9 +60,15 @@ def labelled(
     labels, names = made_labels(out)
     marked = None if files.bone is not None else _marked_bone(strokes, files.bone_label)
     tell(0.0)
-    made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, **dict(strokes), watch=tell)
+    told = partial(_of_tissues, tell)
+    made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, **dict(strokes), progress=told)
     bone = next((name for name in read_names(names).values() if name.casefold() == marked), None)
     return files.model_copy(update={"labels": labels, "names": names, "bone_label": bone}), (made.section,)
+
+
+def _of_tissues(tell: Callable[[float], None], _: str, stage: str, fraction: float) -> None:
+    if stage == TISSUES:
+        tell(fraction)
 
 
 def _marked_bone(strokes: Marks, named: str | None) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import correct_labels, fit_mask, read_image, read_labels, write_labels
+from dvc import Image, correct_labels, fit_mask, read_labels, write_labels
 from dvc.atomic_files import write_json
 from dvc.labelling.boundaries import CorrectedLabels
 from dvc.report.drawing import Drawing
@@ -21,10 +21,10 @@ _LEAST_SHARE = 0.001  # told as one: the number of voxels says more where a stro
 
 
 def corrected(
-    load0: Path, drawn: GivenLabels, strokes: Marks, files: LabelFiles, watch: Callable[[float], None]
+    load0: Path, image: Image, drawn: GivenLabels, strokes: Marks, files: LabelFiles, watch: Callable[[float], None]
 ) -> Labelled:
     """Correct a label map (`dvc.correct_labels`), and write it with its names, picture and record."""
-    began, image = time.perf_counter(), read_image(load0)
+    began = time.perf_counter()
     assert drawn.labels is not None
     given = fit_mask(read_labels(drawn.labels, drawn.names), image.grid, str(drawn.labels))
     marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +32,16 @@ from mrstrain.measurement.label_files import LabelFiles, Labelled, read_made, vi
 from mrstrain.measurement.strokes import read_marks
 from mrstrain.options.door import door
 from mrstrain.options.measurement import BoneAndBody, GivenLabels, Marks
+from mrstrain.records.durations import TISSUES, labelling
+from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import file_hash, provenance
+from mrstrain.records.time_left import WRITING
 
 
 @door
 def label(
     load0: Path | str, *, out: Path | str, masks: BoneAndBody, strokes: Marks, drawn: GivenLabels,
-    watch: Callable[[float], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> Labelled:  # fmt: skip
     """Label skin, fat, muscle and bones of an unloaded image, or correct its label map.
 
@@ -54,8 +58,8 @@ def label(
         ``labels`` of this image, which are corrected as in `dvc.correct_labels`: near the strokes, or without strokes
         at the boundaries of bones and skin. Or ``labels`` of another subject's image (``from_image``), which are
         transferred as in `dvc.labels_from`.
-    watch
-        As in `dvc.label_tissues`.
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
 
     Raises
     ------
@@ -63,26 +67,30 @@ def label(
         Before anything is written: if no bone is given or marked, a file cannot be read or does not fit, or an input
         would be overwritten.
     """
-    source, tell = Path(load0), watch or (lambda _: None)
-    files = LabelFiles.of(out, (source, *masks.paths, *strokes.paths, *drawn.paths))
+    source, whole = Path(load0), partial(progress or (lambda *_: None), "label")
+    files, tell = LabelFiles.of(out, (source, *masks.paths, *strokes.paths, *drawn.paths)), partial(whole, TISSUES)
+    corrects = drawn.labels is not None and drawn.from_image is None
+    if corrects and masks.paths:
+        raise InputError(
+            "A label map of this image (--labels) holds its bones and body. Give it without masks (--bone, --tissue)."
+        )
+    began, image, changed = time.perf_counter(), read_image(source), list[str]()
+    carried = drawn.from_image is not None
+    expect(progress, {"label": labelling(float(np.prod(image.grid.shape)), carried=carried)})
     before = None
-    if drawn.labels is not None and drawn.from_image is None:
-        if masks.paths:
-            raise InputError(
-                "A label map of this image (--labels) holds its bones and body. Give it without masks (--bone, "
-                "--tissue)."
-            )
+    if drawn.labels is not None and corrects:
         before = None if strokes.marks is None else read_made(drawn.labels, drawn.names)
         if before is None:
-            return corrected(source, drawn, strokes, files, tell)
-    began, image, changed = time.perf_counter(), read_image(source), list[str]()
+            again = corrected(source, image, drawn, strokes, files, tell)
+            whole(WRITING, 1.0)
+            return again
     bone, body = (None if one is None else read_mask(one, image.grid) for one in (masks.bone, masks.tissue))
     marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
     if before is not None:
-        again = correct_labels(image, before.labels, marks=marks, probability=before.probability, watch=tell)
-        assert again.probability is not None
-        made = TissueLabels(again.labels, again.probability, (*before.notes, *again.notes))
-        title, changed = "Label map corrected by strokes", [f"{changed_told(again)}."]
+        near = correct_labels(image, before.labels, marks=marks, probability=before.probability, watch=tell)
+        assert near.probability is not None
+        made = TissueLabels(near.labels, near.probability, (*before.notes, *near.notes))
+        title, changed = "Label map corrected by strokes", [f"{changed_told(near)}."]
     elif drawn.paths:
         made, title = _from_another(image, bone, body, marks, drawn, tell), "Label map made from another subject"
     else:
@@ -90,6 +98,7 @@ def label(
     names = tuple(made.labels.names.values())
     inputs = {"load0": source, **{role: of[0] for role, of in (masks.files | strokes.files | drawn.files).items()}}
     found = {"uncertain": made.uncertain, "notes": list(made.notes), "seconds": round(time.perf_counter() - began, 1)}
+    whole(WRITING, 0.0)
     with files.alone():
         write_labels(files.labels, made.labels)
         write_vectors(
@@ -100,6 +109,7 @@ def label(
         picture = Drawing.of("Tissues and their probability", label_slices, *shown).save(files.stem)
         record = provenance("label", inputs, {}) | found | {"labels_sha256": file_hash(files.labels)}
         write_json(files.beside(".json"), record)
+    whole(WRITING, 1.0)
     volumes = volumes_ml(made.labels)
     uncertain = f"{100 * made.uncertain:.0f} % of the voxels have an uncertain label (probability below 90 %)"
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"

@@ -39,7 +39,7 @@ from mrstrain.options.measurement import (
     SubjectFiles,
 )
 from mrstrain.options.model import Flag
-from mrstrain.records.durations import LABELS, REPORT, registrations
+from mrstrain.records.durations import LABELS, REPORT, TISSUES, registrations
 from mrstrain.records.inputs import (
     alone,
     case_names,
@@ -128,7 +128,7 @@ def register(
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
         if to_label:
             _hold(target, stack)
-            making = partial(tell, LABELS, "tissues")
+            making = partial(tell, LABELS, TISSUES)
             subject_files, of_labels = labelled(load0, subject_files, strokes, target, making)
         subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
         subject = replace(subject, tissue=subject.body())

@@ -2,21 +2,30 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dvc import LabelMap
 from dvc.arrays import BoolArray, IntArray
-from dvc.registration.engine import Cost
-from fe import MaterialSet
 from mrstrain.records.time_left import STARTING, WRITING, Expected
+
+if TYPE_CHECKING:  # for a worker of a study that does not register or simulate, nor imports what does
+    from dvc import LabelMap
+    from dvc.registration.engine import Cost
+    from fe import MaterialSet
 
 LABELS = "labels"
 """The case of the label map that `register` makes."""
 REPORT = "report"
 """The case, or the last part of one, in which tables, figures and the report of a command are written."""
+TISSUES = "tissues"
+"""Part of a label map that is made."""
 MESHING, SIMULATING = "meshing", "simulating"
 """Parts of a mesh and of a simulation."""
+
+USUAL_VOXELS = 2e6
+"""Voxels of an image of which nothing is known."""
 
 # From 13 recorded demonstrations on two idle cores (2.3 million voxels; 35,000 or 80,000 cells, four loads), and from
 # registrations of 0.3 to 17 million voxels (benchmarks/results/register_scaling.json). Of a registration beside its
@@ -46,7 +55,10 @@ _START_S = 3.0  # of a load path, beside its loads
 PASSED = 0.3
 """Time of a load that a load path passes, over one of its own."""
 _FIGURES_S = 2.0  # of a material set
-_LABEL_S_PER_MVOXEL = 5.0
+# Of a phantom, for each million voxels: an unloaded image, a loaded one, and its true displacement and strain.
+_UNLOADED_S_PER_MVOXEL, _LOADED_S_PER_MVOXEL, _TRUTH_S_PER_MVOXEL = 2.9, 8.0, 4.4
+_LABEL_S_PER_MVOXEL, _LABEL_WRITING_S_PER_MVOXEL = 5.0, 0.4
+_CARRIED = 2.5  # of the time of a label map: one that is transferred from another subject
 _REPORT_S, _ACCURACY_REPORT_S, _MESH_WRITING_S = 1.0, 2.0, 2.0
 # A `Cost` has the time for a phantom at 0.8 mm, of which so much is for its voxels.
 _OF_VOXELS_S, _PHANTOM_VOXEL_MM3 = 24.0, 0.512
@@ -60,13 +72,13 @@ _SHAPE, _CELLS_PER_FACE = 0.1, 0.85
 class PathSize:
     """What is known of a load path before it is solved: its material set, and numbers of its loads."""
 
-    material: MaterialSet
+    material: "MaterialSet"
     loads: int
     passed: int  # loads of another path that it passes
 
 
 def registrations(
-    names: Iterable[str], cost: Cost, voxels: float, *, twin: bool = False, label_first: bool = False
+    names: Iterable[str], cost: "Cost", voxels: float, *, twin: bool = False, label_first: bool = False
 ) -> dict[str, Expected]:
     """Registrations of loads with an engine of this cost, and the report; ``voxels`` of the unloaded image.
 
@@ -75,6 +87,17 @@ def registrations(
     parts, first = registration_s(cost, voxels, twin=twin), {LABELS: Expected(label_s(voxels))} if label_first else {}
     loads = {name: Expected.of(parts, kind="register", before=tuple(first)) for name in names}
     return first | loads | {REPORT: Expected(_REPORT_S, before=tuple(loads))}
+
+
+def labelling(voxels: float, *, carried: bool = False) -> Expected:
+    """A label map of an image of so many voxels; ``carried`` from another subject, or not."""
+    making = label_s(voxels) * (_CARRIED if carried else 1.0)
+    return Expected.of({TISSUES: making, WRITING: _LABEL_WRITING_S_PER_MVOXEL * voxels / 1e6})
+
+
+def usual_registration(cost: "Cost", *, twin: bool = False) -> Expected:
+    """A registration of images of usual size; its parts have nearly the same shares at other sizes."""
+    return Expected.of(registration_s(cost, USUAL_VOXELS, twin=twin))
 
 
 def simulations(
@@ -101,7 +124,24 @@ def comparison(models: Sequence[int], at_once: int) -> Expected:
     return Expected.of({name: part_s / at_once for name, part_s in comparison_s(models).items()})
 
 
-def phantom_s(cost: Cost, voxel_mm3: float) -> float:
+def phantom_images(unloaded: Iterable[str], loads: Iterable[str], voxels: float) -> Expected:
+    """A phantom: unloaded images of so many voxels, and loaded ones with their truth; parts by the images' names."""
+    parts = dict.fromkeys(unloaded, _UNLOADED_S_PER_MVOXEL * voxels / 1e6)
+    loaded = {name: _LOADED_S_PER_MVOXEL + _TRUTH_S_PER_MVOXEL for name in loads}
+    return Expected.of(parts | {name: each * voxels / 1e6 for name, each in loaded.items()})
+
+
+def driven(sets: Iterable["MaterialSet"], loads: Iterable[str], cells: float) -> Expected:
+    """Simulations with measured boundary conditions on a mesh of so many cells; parts as `driven_part`."""
+    return Expected.of({driven_part(one.name, load): load_s(cells, material=one) for one, load in product(sets, loads)})
+
+
+def driven_part(material: str, load: str) -> str:
+    """The part of one material set and load."""
+    return f"{material}, {load}"
+
+
+def phantom_s(cost: "Cost", voxel_mm3: float) -> float:
     """Time to make, register and score a phantom with voxels of this volume."""
     return float(cost.phantom_seconds - _OF_VOXELS_S * (1.0 - _PHANTOM_VOXEL_MM3 / voxel_mm3))
 
@@ -116,7 +156,7 @@ def meshing(cells: float) -> Expected:
     return Expected.of({MESHING: mesh_s(cells) - _MESH_WRITING_S, WRITING: _MESH_WRITING_S}, guessed=(MESHING,))
 
 
-def registration_s(cost: Cost, voxels: float, *, twin: bool = False) -> dict[str, float]:
+def registration_s(cost: "Cost", voxels: float, *, twin: bool = False) -> dict[str, float]:
     """Time of each part of the registration of a load with an engine of this cost, by the part's name.
 
     ``voxels`` of the unloaded image; with ``twin``, the synthetic warp of the load is registered, too.
@@ -144,13 +184,13 @@ def mesh_s(cells: float) -> float:
     return _MESH_S + _MESH_S_PER_CELL * cells
 
 
-def load_s(cells: float, element: str = "P1", material: MaterialSet | None = None) -> float:
+def load_s(cells: float, element: str = "P1", material: "MaterialSet | None" = None) -> float:
     """Time of a load with a material set on a mesh of so many cells; without a set, that of trebbi."""
     times = _ELEMENT_TIMES[element] * (1.0 if material is None else _set_time(material))
     return float(_LOAD_S * (cells / _CELLS) ** _GROWTH) * times
 
 
-def _set_time(one: MaterialSet) -> float:
+def _set_time(one: "MaterialSet") -> float:
     """Time of a solution over that of the material set trebbi."""
     softest_mpa = min(material.shear_modulus_mpa for material in one.materials.values())
     return _SET_TIMES.get(one.name, float((_SOFT_MPA / softest_mpa) ** _SOFTER))
@@ -162,7 +202,7 @@ def comparison_s(models: Sequence[int]) -> dict[str, float]:
     return {name: share * whole_s for name, share in _COMPARE_PARTS.items()}
 
 
-def cells_of(labels: LabelMap, bones: Sequence[str], edge_mm: float) -> float:
+def cells_of(labels: "LabelMap", bones: Sequence[str], edge_mm: float) -> float:
     """Approximate number of cells of a mesh of all labels but the ``bones``."""
     soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in bones and n != 0])
     volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3

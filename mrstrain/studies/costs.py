@@ -13,7 +13,7 @@ from dvc.threads import usable_cores
 from fe import LoadStep, material_set, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
-from mrstrain.records.durations import cells_of, comparison_s, label_s, load_s, mesh_s, registration_s
+from mrstrain.records.durations import USUAL_VOXELS, cells_of, comparison_s, label_s, load_s, mesh_s, registration_s
 from mrstrain.records.progress import duration
 from mrstrain.records.time_left import Expected, TimeLeft
 from mrstrain.studies.file import Study
@@ -32,7 +32,7 @@ _REGISTER_GIB = 0.65
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _COMPARE_GIB, _OTHER_GIB = 1.0, 1.5  # a comparison: of it, and of each of its processes
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
-_USUAL_VOXELS, _USUAL_CELLS = 2e6, 60e3
+_USUAL_CELLS = 60e3
 _GIB = 1024.0**3
 
 
@@ -54,7 +54,7 @@ def sizes_of(study: Study) -> tuple[float, float]:
         assert drawn is not None
         labels = read_labels(*drawn)
     except (InputError, OSError):
-        return _USUAL_VOXELS, _USUAL_CELLS
+        return USUAL_VOXELS, _USUAL_CELLS
     return voxels, cells_of(labels, bones_of(labels, how.bones), how.edge_mm)
 
 

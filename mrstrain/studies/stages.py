@@ -6,23 +6,22 @@ returns its contribution to the report and the log.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from dvc import Verdict
 from dvc.report.page import Section
 from mrstrain.options.model import Options
+from mrstrain.records.durations import MESHING, TISSUES, comparison, usual_registration
 from mrstrain.records.progress import NOTE
-from mrstrain.records.time_left import WRITING
+from mrstrain.records.time_left import WRITING, Expected
+
+if TYPE_CHECKING:
+    from dvc import Engine
 
 _M = TypeVar("_M", bound=Options)
 Tell = Callable[[str, float], None]
-_PARTS = {
-    "aligning": (0.0, 0.3), "registering": (0.3, 0.5), "strain and figures": (0.8, 0.2),
-    "reading": (0.0, 0.2), "comparing": (0.2, 0.47), "writing": (0.67, 0.33),
-    "meshing": (0.0, 1.0),
-}  # fmt: skip
-# of the time of a registration or a comparison: when each of its parts begins, and how much of it the part takes
 _LEFT_OUT = (
     "The input uncertainty of the models was skipped (quick): intervals and significant differences treat mesh, "
     "forces, directions and parameters of simulated models as exact."
@@ -51,8 +50,11 @@ def label(tell: Tell, *, load0: Path, out: Path, **options: Any) -> StageResult:
     from mrstrain.measurement.label import label as run
     from mrstrain.measurement.label_command import labelled_by_command
 
-    make = labelled_by_command if "command" in options else run
-    done = make(load0, out=out, watch=lambda share: tell("tissues", share), **options)
+    if "command" in options:
+        done = labelled_by_command(load0, out=out, watch=partial(tell, TISSUES), **options)
+    else:
+        whole = _whole(tell, Expected.of({TISSUES: 1.0}))
+        done = run(load0, out=out, progress=lambda _, *stage: whole(*stage), **options)
     return StageResult(tuple(done.summary()[:-1]), (done.section,), headline=done.headline)
 
 
@@ -60,21 +62,30 @@ def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **o
     """Register one loaded image; as `mrstrain.measurement.register.register_one`."""
     from mrstrain.measurement.register import register_one
 
-    case = register_one(load0, load, repeat=next(iter(repeat), None), tell=_whole(tell), **options)
+    whole = _whole(tell, usual_registration(_engine(options).cost, twin=bool(options.get("twin"))))
+    case = register_one(load0, load, repeat=next(iter(repeat), None), tell=whole, **options)
     return StageResult(tuple(case.summary()), (case.section,), headline=case.headline)
 
 
-def _whole(tell: Tell) -> Tell:
-    """Progress of parts as that of the whole; a part without a known share leaves it as it is."""
+def _whole(tell: Tell, expected: Expected) -> Tell:
+    """Progress of parts as that of the whole; a part that is not expected leaves it as it is."""
     reached = 0.0
 
     def told(part: str, fraction: float) -> None:
         nonlocal reached
-        begin, share = _PARTS.get(part, (reached, 0.0))
-        reached = max(reached, begin + share * fraction)
+        reached = max(reached, expected.share(part, fraction))
         tell(part, reached)
 
     return told
+
+
+def _engine(options: Mapping[str, Any]) -> "Engine":
+    """The engine of a registration with such options."""
+    from mrstrain.measurement.engines import engine_of
+    from mrstrain.options.measurement import RegistrationOptions
+
+    chosen = {name: options[name] for name in RegistrationOptions.model_fields if name in options}
+    return engine_of(RegistrationOptions.of(chosen), labelled=True)
 
 
 def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any) -> StageResult:
@@ -82,7 +93,7 @@ def mesh(tell: Tell, *, labels: Path, ratio: float | None = None, **options: Any
     from mrstrain.models.mesh import mesh as run, mesh_coarser
     from mrstrain.options.modelling import Labelling, Meshing
 
-    whole = _whole(tell)
+    whole = _whole(tell, Expected.of({MESHING: 1.0}))
 
     def told(_: str, part: str, fraction: float) -> None:
         whole(part, fraction)
@@ -152,7 +163,7 @@ def level(tell: Tell, *, load0: Path, model: Path, load: str, **options: Any) ->
     """Forward-model comparison of one model and load; as `mrstrain.level`."""
     from mrstrain.comparison.level import level as run
 
-    whole = _whole(tell)
+    whole = _whole(tell, usual_registration(_engine(options).cost))
     done = run(load0, model, loads=[load], threads=1, progress=lambda _, *stage: whole(*stage), **options)
     return StageResult(tuple(done.summary()[:-1]))
 
@@ -164,7 +175,7 @@ def compare(tell: Tell, **options: Any) -> StageResult:
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
     variants = [*options.pop("variants", []), *options.pop("variants_elsewhere", [])]
     remarks = [_LEFT_OUT] if options.pop("quick", False) else []
-    whole = _whole(tell)
+    whole = _whole(tell, comparison([1], 1))
     done = run(
         options.pop("dvc"), models, variants=variants, remarks=remarks, progress=lambda _, *stage: whole(*stage),
         **options,

@@ -15,9 +15,11 @@ from dvc.io.result_folder import PROVENANCE, REGIONS, write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.options.door import door
 from mrstrain.options.modelling import HeelShape
+from mrstrain.records.durations import phantom_images
 from mrstrain.records.inputs import alone, output_folder, refuse_small_disk
-from mrstrain.records.progress import OnProgress
+from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import provenance
+from mrstrain.records.time_left import Expected
 from phantoms import LOADS, Heel, covering, heel_grid, labels_of, labels_to_mesh, random_foot_motion, scan, under_load
 
 TRUTH = "truth"
@@ -25,6 +27,8 @@ TRUTH = "truth"
 
 _BYTES_PER_VOXEL = 12  # measured: files of one load, image and truth
 _REPEAT = 100  # acquisition number of the repeat scan
+_CASE, _AGAIN = "phantom", "Load0-again"
+_OF_IMAGE = 0.65  # of the time of a load, its image; the other part is the truth
 _Motions = Mapping[str, Motion]
 _Record = dict[str, object]
 
@@ -44,7 +48,7 @@ class PhantomFiles:
             f"Images: {', '.join(path.name for path in self.images.values())}; truth: {at / TRUTH}",
             f"To register them: mrstrain register {self.images['Load0']} {loads} --bone {at / 'calcaneus.nii.gz'} "
             f"--labels {at / 'tissues.nii.gz'} --names {at / 'tissues.csv'} "
-            f"--repeat {self.images['Load0-again']} --out {at / 'results'}",
+            f"--repeat {self.images[_AGAIN]} --out {at / 'results'}",
         ]
 
 
@@ -106,10 +110,12 @@ def _write_images(
     images: dict[str, Path] = {}
     foot_motions: dict[str, RigidMotion] = {}
     writes: list[Future[None]] = []
-    steps = iter(np.linspace(0.0, 1.0, 3 + 2 * len(motions)))
+    acquisitions = {_AGAIN: _REPEAT} | {load: 1 + list(LOADS).index(load) for load in motions}
+    how_long = phantom_images(("Load0", _AGAIN), motions, float(np.prod(grid.shape)))
+    expect(progress, {_CASE: Expected(how_long.seconds)})
 
-    def step() -> None:
-        progress("phantom", "images and truth", float(next(steps)))
+    def told(name: str, done: float) -> None:
+        progress(_CASE, "images and truth", how_long.share(name, done))
 
     # Files are compressed in one thread while the next image is formed here.
     with ThreadPoolExecutor(1) as pool:
@@ -118,24 +124,23 @@ def _write_images(
             images[name] = target / f"{name}.nii.gz"
             writes.append(pool.submit(write_image, images[name], image))
 
-        step()
+        told("Load0", 0.0)
         write("Load0", scan(heel, grid, snr=snr, number=0))
         writes.append(pool.submit(write_mask, target / "calcaneus.nii.gz", bone))
         writes.append(pool.submit(write_labels, target / "tissues.nii.gz", labels))
         writes.append(pool.submit(write_labels, target / "tissues_to_mesh.nii.gz", labels_to_mesh(heel, labels)))
-        acquisitions = {"Load0-again": _REPEAT} | {load: 1 + list(LOADS).index(load) for load in motions}
         for name, number in acquisitions.items():
             foot = foot_motions[name] = random_foot_motion(heel.seed, number)
             loaded_grid = covering(grid, foot.apply(bone.points()))
-            step()
+            told(name, 0.0)
             write(name, scan(heel, loaded_grid, motions.get(name), foot, snr=snr, number=number))
             if name in motions:
-                step()
+                told(name, _OF_IMAGE)
                 maps = strain_maps(motions[name], body)
                 writes.append(pool.submit(_write_truth, target / TRUTH / name, maps, labels, record))
         for done in writes:
             done.result()
-    step()
+    progress(_CASE, "images and truth", 1.0)
     record["foot_motion"] = {
         name: {"rotation": m.rotation.tolist(), "translation_lps_mm": m.translation_mm.tolist()}
         for name, m in foot_motions.items()
