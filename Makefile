@@ -30,6 +30,8 @@ UPGRADE ?=
 TESTS ?=
 VENV := .venv
 QUIETLY := --disable-pip-version-check --quiet
+# In a terminal, the packages and a bar for each; in a log, the four lines of the set-up.
+WITH_PROGRESS = --disable-pip-version-check $$(test -t 1 || echo --quiet)
 ifeq ($(OS),Windows_NT)
 BIN := $(VENV)/Scripts
 else
@@ -57,14 +59,18 @@ $(VENV)/dependencies.stamp: requirements.lock
 		"Install one (on Debian and Ubuntu also python3-venv), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "mrstrain needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
-	"$(PYTHON)" -m venv --clear $(VENV)
-	$(BIN)/python -m pip install $(QUIETLY) --no-compile --require-hashes --only-binary :all: -r requirements.lock
+	@echo "Set-up 1 of 4: making the environment $(VENV) with $(PYTHON)"
+	@"$(PYTHON)" -m venv --clear $(VENV)
+	@echo "Set-up 2 of 4: installing $$(grep -c == requirements.lock) packages (a minute or more, most of it downloads)"
+	@$(BIN)/python -m pip install $(WITH_PROGRESS) --no-compile --require-hashes --only-binary :all: -r requirements.lock
+	@echo "Set-up 3 of 4: compiling them (half a minute)"
 	@$(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV) || true  # some have files that no Python can compile
 	@touch $@
 
 # Built with the hatchling that the lock has pinned, so nothing comes in without a hash.
 $(VENV)/installed.stamp: $(VENV)/dependencies.stamp pyproject.toml
-	$(BIN)/python -m pip install $(QUIETLY) --no-deps --no-build-isolation -e .
+	@echo "Set-up 4 of 4: installing mrstrain"
+	@$(BIN)/python -m pip install $(QUIETLY) --no-deps --no-build-isolation -e .
 	@touch $@
 
 demo: setup
