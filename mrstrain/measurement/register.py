@@ -39,7 +39,7 @@ from mrstrain.options.measurement import (
     SubjectFiles,
 )
 from mrstrain.options.model import Flag
-from mrstrain.records.durations import LABELS, REPORT, TISSUES, registrations
+from mrstrain.records.durations import LABELS, REPORT, TISSUES, reading_s, registrations
 from mrstrain.records.inputs import (
     alone,
     case_names,
@@ -122,7 +122,7 @@ def register(
         to_label = subject_files.labels == AUTO
         seen = float(np.prod(images[cases[0]].grid.shape))  # about as many voxels as the unloaded image has
         how_long = registrations(cases, chosen.cost, seen, twin=registration.twin, label_first=to_label)
-        expect(progress, how_long, at_once)
+        expect(progress, how_long, at_once, reading_s=sum(reading_s(image.values.size) for image in images.values()))
         # Read now: what is wrong with it must not be found after an hour.
         model = None if registration.error_model is None else read_error_model(registration.error_model)
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]

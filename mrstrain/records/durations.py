@@ -31,6 +31,7 @@ USUAL_VOXELS = 2e6
 # registrations of 0.3 to 17 million voxels (benchmarks/results/register_scaling.json). Of a registration beside its
 # engine (`Cost`): whatever the size, and for each million voxels.
 _ALIGN_S, _ALIGN_S_PER_MVOXEL = 2.0, 0.8
+_READ_S_PER_MVOXEL = 0.03
 _ENGINE_S = 2.5
 _MAPS_S, _MAPS_S_PER_MVOXEL = 3.5, 0.7
 _TWIN = 1.3  # additional time, relative: the synthetic warp is made and registered
@@ -172,6 +173,11 @@ def registration_s(cost: "Cost", voxels: float, *, twin: bool = False) -> dict[s
         parts["making the synthetic warp"] = _MAKING * more_s
         parts |= {f"synthetic warp: {name}": of_both * parts[name] for name in ("aligning", "registering")}
     return parts | {"strain and figures": maps}
+
+
+def reading_s(voxels: float) -> float:
+    """Time to read a compressed image of so many voxels."""
+    return _READ_S_PER_MVOXEL * voxels / 1e6
 
 
 def label_s(voxels: float) -> float:

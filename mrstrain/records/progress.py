@@ -40,14 +40,17 @@ _COUNTED = re.compile(r"(\d+) of \1\b.*")  # all that there are
 _MOST_SHARE = 0.99  # of what is not done: no line says 100 % while work goes on
 
 
-def expect(progress: OnProgress | None, cases: Mapping[str, Expected], workers: int = 1) -> None:
+def expect(
+    progress: OnProgress | None, cases: Mapping[str, Expected], workers: int = 1, *, reading_s: float = 0.0
+) -> None:
     """Let the progress of a command tell the time left of the whole, if it is shown live.
 
     ``cases`` are all that will be reported, with what they are expected to take on so many ``workers``; what has been
-    expected before stays, as where a command calls another.
+    expected before stays, as where a command calls another. ``reading_s`` is what the images were expected to take
+    that have been read by then: a machine is not slow because they are large.
     """
     if isinstance(progress, Live):
-        progress.expect(cases, workers)
+        progress.expect(cases, workers, reading_s)
 
 
 class Live:
@@ -60,10 +63,10 @@ class Live:
         self._under_way = STARTING
         self._telling, self._stop = threading.Lock(), threading.Event()
 
-    def expect(self, cases: Mapping[str, Expected], workers: int) -> None:
+    def expect(self, cases: Mapping[str, Expected], workers: int, reading_s: float = 0.0) -> None:
         """As `mrstrain.records.progress.expect`."""
         if self._left is None:
-            self._left = TimeLeft.of_command(cases, workers, time.monotonic() - self._began)
+            self._left = TimeLeft.of_command(cases, workers, time.monotonic() - self._began, reading_s)
             self.tell()
             threading.Thread(target=self._keep_up, name="time left", daemon=True).start()
 

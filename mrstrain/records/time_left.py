@@ -113,12 +113,15 @@ class TimeLeft:
     reached: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     @classmethod
-    def of_command(cls, stages: Mapping[str, Expected], workers: int, starting_s: float) -> Self:
-        """The time left of a command with such parts, which took so long to start; a busy machine is slow then, too."""
-        trust_s = _TRUST * sum(one.seconds for one in stages.values())
-        return cls(
-            {STARTING: Expected(_STARTING_S), **stages}, workers, trust_s, {STARTING: 0.0}, {STARTING: starting_s}
-        )
+    def of_command(
+        cls, stages: Mapping[str, Expected], workers: int, starting_s: float, reading_s: float = 0.0
+    ) -> Self:
+        """The time left of a command with such parts, which took so long to start; a busy machine is slow then, too.
+
+        Until then it read its images, too, which is expected to take ``reading_s``.
+        """
+        trust_s, start = _TRUST * sum(one.seconds for one in stages.values()), Expected(_STARTING_S + reading_s)
+        return cls({STARTING: start, **stages}, workers, trust_s, {STARTING: 0.0}, {STARTING: starting_s})
 
     def begin(self, name: str) -> None:
         """Note that a stage has begun; again if it was begun anew."""

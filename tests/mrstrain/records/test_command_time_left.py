@@ -19,10 +19,15 @@ from mrstrain.records.durations import (
     PathSize,
     accuracy_runs,
     comparison,
+    driven,
+    driven_part,
+    labelling,
     meshing,
+    phantom_images,
     phantom_s,
     registrations,
     simulations,
+    usual_registration,
 )
 from mrstrain.records.time_left import Expected, Pace, TimeLeft
 
@@ -53,6 +58,25 @@ def expected(size: dict[str, Any]) -> dict[str, Expected]:
         return {"compare": comparison(size["models"], size["workers"])}
     runs_s = size["phantoms"] * phantom_s(GaussNewton.cost, size["voxel_mm3"])
     return {"accuracy": accuracy_runs(f"{size['phantoms']} registrations", runs_s)}
+
+
+def test_parts_of_label_maps_phantoms_and_driven_models_lead_from_nothing_to_all() -> None:
+    of = [
+        labelling(2e6),
+        phantom_images(("Load0", "Load0-again"), ("Load1", "Load3"), 2e6),
+        driven((TREBBI, material_set("luboz")), ("Load1", "Load2"), 30e3),
+        usual_registration(GaussNewton.cost, twin=True),
+    ]
+    for one in of:
+        shares = [one.share(part, done) for part in one.parts for done in (0.0, 0.5, 1.0)]
+        assert shares[0] == 0.0
+        assert shares == sorted(shares)
+        assert shares[-1] == 1.0
+    assert labelling(2e6, carried=True).seconds > 2.0 * of[0].seconds > 10.0
+    assert list(of[2].parts)[2] == driven_part("luboz", "Load1")
+    assert of[2].parts["luboz, Load1"] > 2.0 * of[2].parts["trebbi, Load1"]
+    # a loaded image with its truth takes longer than an unloaded one
+    assert of[1].parts["Load3"] > 3.0 * of[1].parts["Load0-again"] > 10.0
 
 
 @pytest.fixture

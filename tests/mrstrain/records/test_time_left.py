@@ -242,3 +242,10 @@ def test_a_stage_that_tells_how_far_it_is_needs_no_end_to_correct_the_pace(clock
     for case in ("Load1", "Load2", "Load3"):
         left.told(case, FAILED, 1.0)
     assert left.seconds() == 0.0
+
+
+def test_the_reading_of_large_images_is_no_sign_of_a_slow_machine(clock: list[float]) -> None:
+    loads = {"Load1": Expected(100.0)}
+    usual, large = TimeLeft.of_command(loads, 1, 1.5), TimeLeft.of_command(loads, 1, 9.5, reading_s=8.0)
+    assert usual.seconds() == large.seconds() == pytest.approx(100.0)
+    assert TimeLeft.of_command(loads, 1, 9.5).seconds() > 110.0
