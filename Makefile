@@ -65,6 +65,8 @@ $(VENV)/dependencies.stamp: requirements.lock
 # Built with the hatchling that the lock has pinned, so nothing comes in without a hash.
 $(VENV)/installed.stamp: $(VENV)/dependencies.stamp pyproject.toml
 	$(BIN)/python -m pip install $(QUIETLY) --no-deps --no-build-isolation -e .
+	@echo "Compiling what a registration computes with, and trying it:"
+	@$(THREADS) $(BIN)/python -c 'from dvc.registration.self_test import self_test; print(self_test())'
 	@touch $@
 
 demo: setup
