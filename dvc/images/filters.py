@@ -27,8 +27,8 @@ _BEYOND = {"nearest": "edge", "reflect": "symmetric", "wrap": "wrap"}  # scipy's
 def gaussian(values: _Values, sigma: npt.ArrayLike, mode: str = "reflect", order: npt.ArrayLike = 0) -> _Values:
     """Values (ni, nj, nk), floats, convolved with a Gaussian of ``sigma`` voxels, or with its derivatives.
 
-    ``sigma`` and ``order`` are one number, or one an axis; ``mode`` is what lies beyond the ends, as scipy names it. The
-    sums are in single precision; the result has the type of the values.
+    ``sigma`` and ``order`` are one number, or one an axis; ``mode`` is what lies beyond the ends, as scipy names it.
+    The sums are in single precision; the result has the type of the values.
     """
     widths, orders = np.broadcast_to(sigma, 3), np.broadcast_to(order, 3)
     weights = [_weights(float(width), int(order)) for width, order in zip(widths, orders, strict=True)]
@@ -61,7 +61,8 @@ def _taken(count: int, reach: int, mode: str) -> IntArray:
     """Index of the value that stands at each place (count + 2 reach,) from ``reach`` before the first; -1 for zero."""
     if mode == "constant":
         return np.pad(np.arange(count), reach, constant_values=-1)
-    return np.pad(np.arange(count), reach, mode=_BEYOND[mode])  # type: ignore[call-overload]  # three literals
+    taken: IntArray = np.pad(np.arange(count), reach, mode=_BEYOND[mode])  # type: ignore[call-overload]  # literals
+    return taken
 
 
 @njit(nogil=True, cache=True)

@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image, LabelMap, Mask
-from dvc.registration.engines import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings, register
 
 _SIZE = 32  # voxels of 1 mm along each edge
