@@ -59,18 +59,20 @@ $(VENV)/dependencies.stamp: requirements.lock
 		"Install one (on Debian and Ubuntu also python3-venv), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "mrstrain needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
-	@echo "Set-up 1 of 4: making the environment $(VENV) with $(PYTHON)"
+	@echo "Set-up 1 of 5: making the environment $(VENV) with $(PYTHON)"
 	@"$(PYTHON)" -m venv --clear $(VENV)
-	@echo "Set-up 2 of 4: installing $$(grep -c == requirements.lock) packages (a minute or more, most of it downloads)"
+	@echo "Set-up 2 of 5: installing $$(grep -c == requirements.lock) packages (a minute or more, most of it downloads)"
 	@$(BIN)/python -m pip install $(WITH_PROGRESS) --no-compile --require-hashes --only-binary :all: -r requirements.lock
-	@echo "Set-up 3 of 4: compiling them (half a minute)"
+	@echo "Set-up 3 of 5: compiling them (half a minute)"
 	@$(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV) || true  # some have files that no Python can compile
 	@touch $@
 
 # Built with the hatchling that the lock has pinned, so nothing comes in without a hash.
 $(VENV)/installed.stamp: $(VENV)/dependencies.stamp pyproject.toml
-	@echo "Set-up 4 of 4: installing mrstrain"
+	@echo "Set-up 4 of 5: installing mrstrain"
 	@$(BIN)/python -m pip install $(QUIETLY) --no-deps --no-build-isolation -e .
+	@echo "Set-up 5 of 5: compiling what a registration computes with, and trying it"
+	@$(THREADS) $(BIN)/python -c 'from dvc.registration.self_test import self_test; print(self_test())'
 	@touch $@
 
 demo: setup

@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +35,14 @@ from phantoms import HeelPair, errors_by_tissue, heel_pair
 HERE = Path(__file__).resolve().parents[1]
 
 
-def run(tree: Path, folder: Path, labels: bool, out: Path) -> dict[str, float]:
-    """One run of the command with a tree's code."""
+def run(
+    tree: Path, folder: Path, labels: bool, out: Path, variables: Mapping[str, str] | None = None
+) -> dict[str, float]:
+    """One run of the command with a tree's code, and variables of the environment beside those here."""
     command = [sys.executable, "-m", "mrstrain", "register", "Load0.nii.gz", "Load1.nii.gz"]
     command += ["--bone", "bone.nii.gz", "--out", str(out)]
     command += ["--labels", "tissues.nii.gz", "--names", "tissues.csv"] if labels else []
-    environment = os.environ | {"PYTHONPATH": str(tree)}
+    environment = os.environ | {"PYTHONPATH": str(tree)} | dict(variables or {})
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed copy holds the bytecode of its modules
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)

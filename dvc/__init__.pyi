@@ -33,7 +33,7 @@ from .registration.elastix.engine import Elastix
 from .registration.elastix.presets import Preset, load_preset, preset_names, read_parameter_file
 from .registration.engine import AlignedPair, Engine
 from .registration.engines import engine_named
-from .registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from .registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 from .registration.register import Registration, Settings, register
 from .report.style import FIGURE_STYLE
 from .trust.assessment import Similarity, assess
@@ -44,8 +44,8 @@ from .trust.verdict import Verdict
 
 __all__ = [
     "FIGURE_STYLE", "Affine", "AlignedPair", "Alignment", "BSpline", "Composed", "Deformation", "Elastix", "Engine",
-    "ErrorModel", "ErrorTable", "Evidence", "GaussNewton", "GaussNewtonWithInterfaces", "Grid", "Image",
-    "InterfaceSpline", "LabelMap", "Mask", "Measurement", "MeshFile", "Preset", "Quality", "Registration",
+    "ErrorModel", "ErrorTable", "Evidence", "GaussNewton", "GaussNewtonAtBone", "GaussNewtonWithInterfaces", "Grid",
+    "Image", "InterfaceSpline", "LabelMap", "Mask", "Measurement", "MeshFile", "Preset", "Quality", "Registration",
     "RigidMotion", "SampledDisplacement", "Settings", "Similarity", "StrainField", "StrainMaps", "Subject", "TetMesh",
     "TissueLabels", "Verdict", "Within", "assess", "correct_labels", "engine_named", "errors", "evaluate_on_grid",
     "fit_mask", "label_tissues", "labels_from", "load_preset", "local_correlation", "measure", "noise_floor",

@@ -136,6 +136,8 @@ class Engine(Protocol):
     """The name by which ``--engine`` and results know it."""
     needs_labels: ClassVar[bool] = False
     """Whether it needs a label map of the tissues."""
+    needs_bone: ClassVar[bool] = False
+    """Whether it needs an alignment on a bone."""
     sees_brightness: ClassVar[bool] = True
     """Whether an offset in brightness between the images misleads it; it does not mislead correlation."""
     starts_anywhere: ClassVar[bool] = True

@@ -7,11 +7,12 @@ from dvc.errors import ParameterError
 from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import load_preset, preset_names, read_parameter_file
 from dvc.registration.engine import Engine
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 
 DEFAULT = GaussNewton.name
 """Name of the engine that is used unless another is asked for."""
-ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (GaussNewton, GaussNewtonWithInterfaces)}
+_OURS = GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in _OURS}
 """Engines that are known by one name. elastix is known by its presets and parameter files."""
 
 
@@ -21,7 +22,7 @@ def families() -> list[str]:
 
 
 def engine_named(name: str) -> Engine:
-    """An engine by its name: gauss-newton, gauss-newton-borders, a preset of elastix, or a parameter file (.txt).
+    """An engine by its name: gauss-newton, -bone or -borders, a preset of elastix, or a parameter file (.txt).
 
     Raises
     ------

@@ -267,6 +267,10 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
         )
     if settings.engine.needs_labels and labels is None:
         raise InputError("Strain discontinuities at tissue interfaces need a label map: labels (--labels).")
+    if settings.engine.needs_bone and settings.align_on != "bone":
+        raise InputError(
+            "Discontinuities at the bone need an alignment on the bone: align bone (--align bone), or no borders."
+        )
     for name, given in (("tissue mask", body), ("bone mask", bone), ("label map", labels)):
         if given is None:
             continue

@@ -81,7 +81,10 @@ def doctor() -> None:
         with Worker(threads=1) as worker:
             return str(worker.run(f"trying {what}", import_module(module).self_test))
 
-    tried = {"itk-elastix": "dvc.registration.elastix.run", "pytetwild": "fe.meshing", "sparse solver": "fe.linear"}
+    tried = {
+        "registration": "dvc.registration.self_test", "itk-elastix": "dvc.registration.elastix.run",
+        "pytetwild": "fe.meshing", "sparse solver": "fe.linear",
+    }  # fmt: skip
     findings = examine(trials={what: partial(trial, what, module) for what, module in tried.items()})
     for finding in findings:
         say(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}")

@@ -79,8 +79,10 @@ def fill_engine(given: _E, record: MeasuredWith) -> _E:
     family = how.get("engine")
     if family == ELASTIX:
         return given.model_copy(update=_elastix(record))
-    if family == GAUSS_NEWTON and given.borders is None and "labels" in record.inputs and how.get("borders") is None:
-        return given.model_copy(update={"borders": False})
+    if family == GAUSS_NEWTON and given.borders is None:
+        labelled, borders = "labels" in record.inputs, how.get("borders") is not None
+        if labelled != borders:  # not what it is by default
+            return given.model_copy(update={"borders": borders})
     return given.model_copy(update={"engine": family}) if family not in (None, DEFAULT) else given
 
 

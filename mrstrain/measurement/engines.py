@@ -1,8 +1,9 @@
 """The engine that a command registers with, by the flat options that it was asked with."""
 
-from dvc import Elastix, Engine, GaussNewton, GaussNewtonWithInterfaces, load_preset, read_parameter_file
+from dvc import Elastix, Engine, load_preset, read_parameter_file
 from dvc.errors import InputError, ParameterError
 from dvc.registration.engines import DEFAULT, ENGINES
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 
@@ -23,7 +24,7 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
     """The engine asked for, with its preset, parameter files or weights; options of another engine are refused.
 
     With a label map (``labelled``) the Gauss-Newton engine allows strain discontinuities at tissue interfaces, unless
-    ``borders`` is False.
+    ``borders`` is False. Without one it allows them at the surface of the bone if ``borders`` is True.
     """
     name, preset, parameters = _asked(how), how.preset, how.parameters
     bending, volume, borders = how.bending, how.volume, how.borders
@@ -33,10 +34,15 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
             "volume). Leave the engine out, or set it to elastix."
         )
     if name == GAUSS_NEWTON:
-        if borders and not labelled:
-            raise InputError("borders needs a label map of the tissues on the unloaded image (labels).")
         smooth = GaussNewton(bending=bending, volume=volume)
-        return GaussNewtonWithInterfaces(smooth) if labelled and borders is not False else smooth
+        if labelled and borders is not False:
+            return GaussNewtonWithInterfaces(smooth)
+        if borders and how.align != "bone":
+            raise InputError(
+                "`borders` needs a label map (labels), or an alignment on the bone (align = bone), at whose surface "
+                "strain may then be discontinuous."
+            )
+        return GaussNewtonAtBone(smooth) if borders else smooth
     if bending is not None or volume is not None:
         raise ParameterError(f"bending and volume are only for the engine {GAUSS_NEWTON}; the engine is {name}.")
     if borders:

@@ -173,8 +173,9 @@ class EngineOptions(Options):
     engine: Annotated[str, AfterValidator(_known_engine)] | None = None
     """Registration engine: gauss-newton or elastix. Default: gauss-newton; with --preset or --parameters, elastix."""
     borders: Flag | None = None
-    """gauss-newton with --labels: allow strain discontinuities at tissue interfaces. Default: on. Disable it if
-    label boundaries are wrong by more than one voxel."""
+    """gauss-newton: allow strain discontinuities at tissue interfaces. Default: on with --labels; disable it if label
+    boundaries are wrong by more than one voxel. Without --labels: at the surface of the bone alone, without error
+    bars."""
     preset: str | None = None
     """Built-in elastix parameters: heel-mr."""
     parameters: tuple[Path, ...] = ()
@@ -188,7 +189,7 @@ class RecordedEngine(EngineOptions):
     """Registration engine: gauss-newton or elastix. Default: that of the measurement; with --preset or --parameters,
     elastix."""
     borders: Flag | None = None
-    """gauss-newton with --labels: allow strain discontinuities at tissue interfaces. Default: as in the measurement."""
+    """gauss-newton: allow strain discontinuities at tissue interfaces. Default: as in the measurement."""
     preset: str | None = None
     """Built-in elastix parameters: heel-mr. Default: those of the measurement, if it was made with elastix."""
     parameters: tuple[Path, ...] = ()

@@ -17,16 +17,22 @@ from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Fou
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.first_run import compile_loops
 from dvc.registration.gauss_newton.fit import Parameters, fit
-from dvc.registration.gauss_newton.with_interfaces import STAGE, USUAL_SKIN, fit_with_interfaces
+from dvc.registration.gauss_newton.with_interfaces import STAGE, STAGE_AT_BONE, USUAL_SKIN, fit_with_interfaces
 from dvc.worker import Worker
 
 _UNLABELLED = 0.1  # of the body: more than that was never in a phantom
+_AT_BONE = "bone_alone"  # in a record: the bone's surface is the only interface
 _NOTE = (
     "Strain may be discontinuous at the tissue interfaces of the label map. The bone of the rigid alignment is "
     "constrained to be rigid; its key results are those of the preceding smooth spline. If label boundaries are wrong "
     "by more than a voxel, use --no-borders (study file: borders = false). The whole motion, that of the bone "
     "included, is in transform.h5, as displacements at voxels. No elastix text files are written, because elastix has "
     "no spline with discontinuities."
+)
+_NOTE_AT_BONE = (
+    "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid; the key results of the "
+    "bone are those of the preceding smooth spline. The whole motion, that of the bone included, is in transform.h5, "
+    "as displacements at voxels. No elastix text files are written, because elastix has no spline with discontinuities."
 )
 
 
@@ -166,7 +172,7 @@ class GaussNewtonWithInterfaces(Engine):
         """Methods text from the parameters of a provenance record; empty if another engine was used."""
         last = record.get("borders")
         smooth = GaussNewton.methods({**record, "borders": None}, versions)
-        if not smooth or last is None:
+        if not smooth or last is None or _AT_BONE in last:
             return ""
         skin, held = last.get("skin"), record.get("align") == "bone"
         weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
@@ -206,6 +212,67 @@ class GaussNewtonWithInterfaces(Engine):
             f"{100 * share:.0f} % of the visible tissue has no label, but the error of {self.name} was measured with "
             "every tissue labelled. Label all tissue, or use one smooth spline (--no-borders)."
         )
+
+
+@dataclass(frozen=True, slots=True)
+class GaussNewtonAtBone(Engine):
+    """Strain may be discontinuous at the surface of the bone, which is rigid; no label map is needed.
+
+    Attributes
+    ----------
+    smooth : GaussNewton
+        The smooth spline that is fitted first, with the weights of both fits.
+    """
+
+    smooth: GaussNewton = GaussNewton()
+
+    family, name, note = GaussNewton.family, "gauss-newton-bone", _NOTE_AT_BONE
+    needs_bone = True
+    cost = GaussNewtonWithInterfaces.cost
+
+    @property
+    def text(self) -> str:
+        """Every number that affects the result, as JSON: those of the smooth spline and of the last stage."""
+        return json.dumps(json.loads(self.smooth.text) | {"borders": {_AT_BONE: STAGE_AT_BONE}})
+
+    @property
+    def without_error_model(self) -> str:
+        """Why there is no error model for it yet."""
+        return f"The error of {self.name} has not been measured yet, so there are no error bars."
+
+    def of_repeat(self) -> Self:
+        """With the default weights: weights chosen for a pair without strain would smooth away the noise floor."""
+        return replace(self, smooth=self.smooth.of_repeat())
+
+    def keeping_volume(self) -> Self:
+        """With the weight of incompressible tissue, whatever the images indicate."""
+        return replace(self, smooth=self.smooth.keeping_volume())
+
+    def record(self) -> dict[str, object]:
+        """Its parameters as plain values, for provenance."""
+        return self.smooth.record() | {"borders": {_AT_BONE: True}}
+
+    @classmethod
+    def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
+        smooth = GaussNewton.methods({**record, "borders": None}, versions)
+        if not smooth or _AT_BONE not in (record.get("borders") or {}):
+            return ""
+        return (
+            f"{smooth}; starting from this result, a second B-spline was added that vanishes on the surface of the "
+            "bone, so that strain can be discontinuous there, with a rigid bone"
+        )
+
+    def prepare(self) -> None:
+        """Compile the loops, if no run has done so before."""
+        compile_loops(lambda pair: fit_with_interfaces(pair, self.smooth))
+
+    def find(
+        self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
+    ) -> Found:
+        """Find the displacement between the images of a pair; as in `Engine`. InputError without a bone."""
+        displacement, choice = _run(fit_with_interfaces, pair, (self.smooth, None), start, worker, progress)
+        return Found(displacement, choice, _volume_freed(self.name, choice))
 
 
 def _run(

@@ -23,7 +23,7 @@ from dvc.deformation.interface_spline import NUMBERS, Interfaces, InterfaceSplin
 from dvc.deformation.protocol import Deformation
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from dvc.images.image import Grid, Mask
+from dvc.images.image import Grid, LabelMap, Mask
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.fit import LEVELS, Parameters, brightness_scaled, choose, fit, spline_through, turned
@@ -37,6 +37,7 @@ _SKIN_POWERS = -5, 4  # of the square root of ten, times that: 0.01 to 300
 _SKIN_MARGIN = 5e-4  # of the left-out residual: skin is stiff unless the images say more than that against it
 _STEPS = 3
 _LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps does it better with one
+_WITH_JUMPS = 1  # where the bone is the only tissue that is known
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
 _SMOOTH_SHARE, _DONE = 0.3, (0.6, 0.72, 0.85)  # of the time: the smooth fit, then after each of the other steps
 STAGE = {
@@ -44,6 +45,8 @@ STAGE = {
     "steps": _STEPS, "of_jumps": [_BENDING, _SQUARE], "distances": NUMBERS,
 }  # fmt: skip
 """Every number that decides the result of this stage, for a record."""
+STAGE_AT_BONE = {name: STAGE[name] for name in ("steps", "of_jumps", "distances")} | {"laplacians": _WITH_JUMPS}
+"""The same where the bone is the only tissue that is known."""
 
 
 def fit_with_interfaces(
@@ -52,9 +55,10 @@ def fit_with_interfaces(
 ) -> tuple[InterfaceSpline, Choice]:  # fmt: skip
     """Find the displacement, LPS mm, that carries the fixed image to the moving one, its gradient free at interfaces.
 
-    The pair needs labels; a tissue named "skin" may resist strain, and the bone, if there is one, does not move. The
-    weight k of strain in the skin, 1/mm3, is chosen by cross-validation where it is not given; it becomes the choice's
-    weight "rigidity", zero without skin. The rest is as in `dvc.registration.gauss_newton.fit.fit`.
+    The pair needs labels; without them, the surface of the bone is the only interface. A tissue named "skin" may resist
+    strain, and the bone, if there is one, does not move. The weight k of strain in the skin, 1/mm3, is chosen by
+    cross-validation where it is not given; it becomes the choice's weight "rigidity", zero without skin. The rest is as
+    in `dvc.registration.gauss_newton.fit.fit`.
     """
     usual = replace(parameters, bending=parameters.weights.bending)
     smooth, first = fit(pair, usual, start, lambda share: progress(_SMOOTH_SHARE * share))
@@ -94,16 +98,15 @@ class _Stage:
     """The last stage at full resolution: in the whole body, and in a slab of it in which weights are chosen."""
 
     def __init__(self, pair: AlignedPair, control: Grid, rest: FloatArray | None) -> None:
-        labels, inside = pair.labels, pair.compared.inside
-        if labels is None:
-            raise InputError("Strain discontinuities at tissue interfaces need a label map (labels).")
+        labels, inside = pair.labels or _bone_alone(pair), pair.compared.inside
         self.interfaces = Interfaces.of(labels, pair.bone, float(control.spacing_mm.mean()), pair.body)
         soft = pair.body.inside & (self.interfaces.own != self.interfaces.rest)
         named = [number for number, name in labels.names.items() if name.lower() == _SKIN]
         skin = soft & np.isin(labels.labels, named)
         pictures = brightness_scaled(pair)
         rough = ((1.0, REST), (_BENDING * self.interfaces.reach_mm**2, _SQUARE))
-        roughness, factors = Roughness(control, rough, _LAPLACIANS), self.interfaces.at_voxels()
+        laplacians = _WITH_JUMPS if pair.labels is None else _LAPLACIANS
+        roughness, factors = Roughness(control, rough, laplacians), self.interfaces.at_voxels()
         both = None if rest is None else np.concatenate([rest, np.zeros_like(rest)])
         share = np.cumsum(np.count_nonzero(inside, axis=(1, 2))) / max(np.count_nonzero(inside), 1)
         slab = np.zeros_like(inside)  # the middle third of the voxels along the first axis, from skin to skin
@@ -113,6 +116,13 @@ class _Stage:
             for part in (np.ones_like(soft), slab)
         )
         self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & slab).any())
+
+
+def _bone_alone(pair: AlignedPair) -> LabelMap:
+    """The bone in a tissue that is everywhere else; InputError without a bone."""
+    if pair.bone is None:
+        raise InputError("Strain discontinuities need a label map (labels), or an alignment on a bone mask.")
+    return LabelMap(pair.bone.grid, np.where(pair.bone.inside, 2, 1), {1: "tissue", 2: "bone"})
 
 
 def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:

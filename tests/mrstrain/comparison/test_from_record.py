@@ -126,6 +126,8 @@ def test_interfaces_are_left_out_only_where_a_label_map_was_measured_with(folder
     """Without one there were none to leave out, and labels that are given now are used."""
     record = record_of(measured(folder, "bone", **GAUSS_NEWTON, borders=None))
     assert fill_engine(EngineOptions(), record) == EngineOptions()
+    record = record_of(measured(folder, "bone", **GAUSS_NEWTON, borders={"bone_alone": True}))
+    assert fill_engine(EngineOptions(), record) == EngineOptions(borders=True)
     record = record_of(measured(folder, "labels", **GAUSS_NEWTON, borders=None))
     assert fill_engine(EngineOptions(borders=True), record) == EngineOptions(borders=True)
 

@@ -20,12 +20,12 @@ from dvc.errors import InputError, ParameterError, RegistrationError
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io.images.labels import read_mask
 from dvc.io.images.read import read_image
-from dvc.io.images.write import write_image, write_labels
+from dvc.io.images.write import write_image, write_labels, write_mask
 from dvc.io.result_folder import SPLINE_WITH_BORDERS, result_folders, spline_in
 from dvc.io.transforms.read import read_transform
 from dvc.registration.engine import AlignedPair
-from dvc.registration.engines import engine_named
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.engines import engine_named, methods_of
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 from dvc.registration.gauss_newton.fit import control_grid
 from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings, register
@@ -109,6 +109,29 @@ def test_strain_is_found_up_to_bone_and_skin(pad, out, worker):
     assert after["fat"] < 0.6 * before["fat"]
     assert after["skin"] < 0.3 * before["skin"]
     assert np.nanmax(shear_of(out / "Load1")[pad.labels.region("bone").inside]) == 0.0
+
+
+def test_the_bone_mask_alone_lets_strain_jump_at_the_bone(pad, tmp_path):
+    """Without labels: .101 in fat within 3 mm of bone with one spline, .049 with the bone's surface as an interface."""
+    write_mask(bone := tmp_path / "bone.nii.gz", pad.labels.region("bone"))
+    images = pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"]
+    errors, shear = {}, {}
+    for borders in (None, True):
+        with tasks_run_here():
+            assert not run(*images, out=tmp_path / str(borders), bone=bone, borders=borders, threads=1).failures
+        shear[borders] = shear_of(tmp_path / str(borders) / "Load1")
+        errors[borders] = pad.shear_error(shear[borders])
+    assert errors[True]["fat"] < 0.6 * errors[None]["fat"]
+    assert errors[True]["skin"] < 1.1 * errors[None]["skin"]
+    assert np.nanmax(shear[True][pad.labels.region("bone").inside]) == 0.0
+    folder = tmp_path / "True" / "Load1"
+    assert isinstance(spline_in(folder), InterfaceSpline)
+    told = json.loads((folder / "quality.json").read_text())
+    assert "gauss-newton-bone has not been measured" in json.dumps(told["error_of_max_shear"])
+    record = json.loads((tmp_path / "True" / "provenance.json").read_text())["parameters"]
+    assert record["borders"] == {"bone_alone": True}
+    assert "vanishes on the surface of the bone" in methods_of(record, {})
+    assert "vanishes" not in methods_of(record | {"borders": None}, {})
 
 
 def test_its_transform_is_the_whole_motion_to_itk_and_to_us(pad, out, tmp_path):
@@ -329,10 +352,10 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         GaussNewtonWithInterfaces(skin=0.0)
     with pytest.raises(ParameterError, match="borders is only for the engine gauss-newton"):
         engine_of(RegistrationOptions(preset="heel-mr", borders=True))
-    with pytest.raises(InputError, match="borders needs a label map"):
-        engine_of(RegistrationOptions(borders=True))
+    with pytest.raises(InputError, match=r"need an alignment on the bone: align bone \(--align bone\)"):
+        register(**{**layers, "settings": Settings(GaussNewtonAtBone(), align_on="image")})
     for wrong, kind, said in (
-        ({"bone": pad.folder / "bone.nrrd"}, InputError, "label map"),
+        ({"align": "image"}, InputError, "needs a label map"),
         (asked(pad, preset="heel-mr"), ParameterError, "borders is only for"),
     ):
         with pytest.raises(kind, match=said):

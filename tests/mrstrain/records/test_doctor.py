@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from dvc.errors import MrstrainError
+from dvc.registration import self_test
 from fe import meshing
 from mrstrain.records import doctor
 from mrstrain.records.doctor import Finding, examine
@@ -161,9 +162,17 @@ def test_the_doctor_looks_at_everything_and_finds_this_environment_fit(tmp_path:
 _ELASTIX = pytest.param("dvc.registration.elastix.run", marks=pytest.mark.full_size)  # 8 s of loading it
 
 
-@pytest.mark.parametrize("module", [_ELASTIX, "fe.meshing", "fe.linear"])
+@pytest.mark.parametrize("module", [_ELASTIX, "dvc.registration.self_test", "fe.meshing", "fe.linear"])
 def test_what_it_tries_works_here(module: str) -> None:
     assert import_module(module).self_test()
+
+
+def test_a_registration_that_finds_another_shift_fails_its_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = self_test.register
+    monkeypatch.setattr(self_test, "register", lambda fixed, moving, **given: whole(moving, fixed, **given))
+    (told,) = (one for one in examine(trials={"registration": self_test.self_test}) if one.what.startswith("trial"))
+    assert not told.ok
+    assert "a shift of 0.5 mm was measured as -0.4" in told.detail
 
 
 def test_a_busy_machine_is_slow_and_not_at_fault(monkeypatch: pytest.MonkeyPatch) -> None:
