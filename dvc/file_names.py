@@ -32,11 +32,13 @@ def as_file_name(text: str) -> str:
 
 
 def refuse_path(path: str | os.PathLike[str]) -> None:
-    """InputError for a path that no file can have, with a null character or a name of more than 255 bytes.
+    """InputError for a path that no file can have: empty, with a null character, a name of more than 255 bytes.
 
     And for a pipe or a device, such as /dev/fd/63: reading it might never end.
     """
     text = os.fspath(path)
+    if not text:
+        raise InputError("The path of a file or folder is empty.")
     if "\0" in text:
         raise InputError(f"{text!r} has a null character (\\u0000), which no path has. Type it again.")
     sizes = {part: len(part.encode(errors="replace")) for part in text.split(os.sep)}
