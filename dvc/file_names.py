@@ -1,6 +1,7 @@
 """Names of loads, material sets and models, which become names of files: none leads out of the folder of results."""
 
 import os
+import stat
 import unicodedata
 from collections.abc import Iterable
 
@@ -31,8 +32,13 @@ def as_file_name(text: str) -> str:
 
 
 def refuse_path(path: str | os.PathLike[str]) -> None:
-    """InputError for a path that no file can have: with a null character, or a name of more than 255 bytes."""
+    """InputError for a path that no file can have: empty, with a null character, a name of more than 255 bytes.
+
+    And for a pipe or a device, such as /dev/fd/63: reading it might never end.
+    """
     text = os.fspath(path)
+    if not text:
+        raise InputError("The path of a file or folder is empty.")
     if "\0" in text:
         raise InputError(f"{text!r} has a null character (\\u0000), which no path has. Type it again.")
     sizes = {part: len(part.encode(errors="replace")) for part in text.split(os.sep)}
@@ -41,6 +47,12 @@ def refuse_path(path: str | os.PathLike[str]) -> None:
         raise InputError(
             f"{longest[:40]}...: a name of {size} bytes; file systems take {_MOST_OF_A_PATH}. Choose a shorter one."
         )
+    try:
+        kind = os.stat(text).st_mode
+    except (OSError, ValueError):  # there is none, which whoever reads it says
+        return
+    if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+        raise InputError(f"{text}: a pipe or device, not a file. Save what it yields as a file, and give that one.")
 
 
 def is_utf8(path: os.PathLike[str]) -> bool:

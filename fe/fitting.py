@@ -18,6 +18,7 @@ from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Y
 
 _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
 _MOSTLY = 0.8
+_STRETCHES, _MOST_MPA = (0.01, 100.0), 1e6  # far beyond any tissue, and nothing overflows
 _MOST = 60.0  # no curve determines an exponent beyond this
 _SOFTEST = 1e-3  # least C10 of a polynomial, relative to that of the neo-Hookean model that fits the curves best
 _ABSURD = 1e-4  # probability that curves of a material with a positive modulus are refused
@@ -273,6 +274,16 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
         raise InputError(
             "The stress has the wrong sign: it must be positive in tension (stretch above 1) and negative in "
             "compression (stretch below 1). If the column contains strain, convert it: stretch = 1 + strain."
+        )
+    if not (_STRETCHES[0] <= stretch.min() and stretch.max() <= _STRETCHES[1]):
+        raise InputError(
+            f"Stretches must be between {_STRETCHES[0]:g} and {_STRETCHES[1]:g}; the curves have {stretch.min():g} to "
+            f"{stretch.max():g}. The stretch is the deformed length over the undeformed one."
+        )
+    if np.abs(stress).max() > _MOST_MPA:
+        raise InputError(
+            f"A stress of {np.abs(stress).max():g} MPa is beyond any tissue. Check its unit (column name) and the rows "
+            "of the table."
         )
     if not stress.any():
         raise InputError("The stress is 0 at every point of the curves.")

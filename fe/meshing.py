@@ -27,6 +27,7 @@ _SECONDS_PER_TRIANGLE, _SECONDS_PER_CELL = 5e-4, 3e-4  # as measured on one core
 _MOST_LOST = 0.2  # of a tissue's volume
 _ALIGNED = 0.8  # cosine between a face of the skin and the plane of a truncation surface that it continues
 _RIM_VOXELS = 6.0  # largest width of the truncated skin
+_LEAST_FINER = 0.25  # of a voxel: shorter edges follow nothing in the label map, and fill the memory
 _REFINED_MM = 2.0  # spacing of the lattice on which a finer edge length is given
 
 _Lattice = tuple[FloatArray, IntArray, FloatArray]  # points, tetrahedra and the edge length at each point, mm
@@ -70,8 +71,11 @@ def check_meshing(
         raise InputError(
             f"The edge length must be between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm} mm."
         )
-    if finer is not None and not 0.0 < finer[1] < edge_mm:
-        raise InputError(f"The finer edge length must be between 0 and {edge_mm} mm; got {finer[1]} mm.")
+    if finer is not None and not _LEAST_FINER * spacing <= finer[1] < edge_mm:
+        raise InputError(
+            f"The finer edge length must be between a quarter of a voxel ({_LEAST_FINER * spacing:g} mm) and {edge_mm} "
+            f"mm; got {finer[1]} mm."
+        )
     there = set(np.unique(labels.labels).tolist())
     numbers = {name: number for number, name in labels.names.items() if number in there}
     if not bones:

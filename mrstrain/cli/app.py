@@ -100,6 +100,7 @@ def main() -> None:
     shown.setLevel(logging.WARNING)  # all else is for the log of a command
     logging.basicConfig(format="%(message)s", level=logging.WARNING, handlers=[shown])
     _share_arenas()
+    _leave_out_unusable_settings()
     # What removes the semaphores of processes that an interrupt ended need not tell of them.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
     # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
@@ -142,6 +143,14 @@ def _closed(*_: object) -> None:
     for stream in (1, 2):
         os.dup2(nowhere, stream)
     sys.exit(128 + signal.SIGTERM)
+
+
+def _leave_out_unusable_settings() -> None:
+    """Remove settings of the environment with which matplotlib and numba cannot be imported."""
+    os.environ.pop("MPLBACKEND", None)  # figures are written to files, for which no backend is needed
+    threads = os.environ.get("NUMBA_NUM_THREADS", "").strip()
+    if threads.removeprefix("-").isdecimal() and int(threads) < 1:
+        del os.environ["NUMBA_NUM_THREADS"]
 
 
 def _share_arenas() -> None:

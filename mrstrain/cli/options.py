@@ -6,6 +6,7 @@ import operator
 import re
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, ParamSpec, Protocol, Union, get_args, get_origin, get_type_hints
@@ -62,6 +63,7 @@ EXAMPLES = {
 
 _TYPED = "mrstrain.typed"  # where a context of click keeps the command line
 _HAS_STUDY_LOG = "demo"
+_EMPTY = re.compile(r"--[a-z-]+=")
 _ONE_FILE = ("label", "mesh")  # commands that write a file, and others beside it
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
 
@@ -114,6 +116,11 @@ class Grouped(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; an error on a missing argument or option includes its help."""
         ctx.meta[_TYPED] = [ctx.info_name, *args]
+        for before, one in pairwise(["", *args]):
+            if not one or _EMPTY.fullmatch(one):  # the current folder, otherwise, whose files results may replace
+                of = one.removesuffix("=") or before
+                what = f"The value of {of}" if of.startswith("-") else "An argument"
+                ctx.fail(f"{what} is empty. If it is a variable of the shell, it is not set.")
         try:
             return super().parse_args(ctx, args)
         except Exception as missing:

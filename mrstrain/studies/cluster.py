@@ -1,6 +1,7 @@
 """The Dask cluster on which stages run: the cores of this machine by default, or an existing cluster."""
 
 import logging
+import multiprocessing
 import os
 import queue
 import signal
@@ -27,6 +28,7 @@ from mrstrain.studies.stage_process import Outcome, run_stage
 from mrstrain.studies.stages import StageResult
 
 _MOST_LOST = 3
+_WORKER = "Dask Worker process"  # begins the name of the process of a worker
 _TRIED = "This was computed at the second attempt."
 _TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
 _NOTHING_LOGGED = logging.CRITICAL + 1  # by Dask, as of each message that there is no memory for: stages tell of theirs
@@ -278,7 +280,7 @@ def cluster(
 @contextmanager
 def _of_this_machine(workers: int) -> Iterator[tuple[LocalCluster, Client]]:
     """A cluster of processes of this machine, ended with the block however that ends, with their temporary files."""
-    with _temporary_files():
+    with _temporary_files(), _no_worker_left():
         local = LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, silence_logs=_NOTHING_LOGGED, memory_limit=0,
             host="127.0.0.1", dashboard_address="127.0.0.1:0",
@@ -312,6 +314,18 @@ def _temporary_files() -> Iterator[None]:
                 os.environ["TMPDIR"] = before
 
 
+@contextmanager
+def _no_worker_left() -> Iterator[None]:
+    """End the workers that Dask leaves where it cannot start all of them; this process would wait for them to end."""
+    before = multiprocessing.active_children()
+    try:
+        yield
+    finally:
+        for child in multiprocessing.active_children():
+            if child not in before and child.name.startswith(_WORKER):
+                _kill(_with_all_below(child.pid))
+
+
 def _ignore_interrupts() -> None:
     """Leave Ctrl-C, which a terminal sends to every process, to the one that a person has started."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -326,10 +340,14 @@ def _kill_workers(local: LocalCluster) -> None:
 
 def _processes_of(nanny: Nanny) -> list[psutil.Process]:
     """The process of a worker, which comes first as it would begin the next stage, and all below it."""
-    if nanny.pid is None:  # about to be restarted; psutil would take it for this process
+    return _with_all_below(nanny.pid)
+
+
+def _with_all_below(pid: int | None) -> list[psutil.Process]:
+    if pid is None:  # about to be restarted; psutil would take it for this process
         return []
     try:
-        worker = psutil.Process(nanny.pid)
+        worker = psutil.Process(pid)
         return [worker, *worker.children(recursive=True)]
     except psutil.Error:
         return []

@@ -71,8 +71,17 @@ class Ledger:
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
         """Hashes of the input files of a stage, and its arguments without folders, so that a study can be moved."""
-        files = [[without_folders(str(path), self.home), self._hash(path)] for path in stage.files]
-        return {"files": files, "arguments": without_folders(arguments, self.home)}
+        return {"files": self._inputs(stage), "arguments": without_folders(arguments, self.home)}
+
+    def are_unchanged(self, stage: Stage, made_from: Mapping[str, Any]) -> bool:
+        """Whether the input files of a stage are as they were when it began."""
+        try:
+            return bool(self._inputs(stage) == made_from["files"])
+        except OSError:  # one is gone
+            return False
+
+    def _inputs(self, stage: Stage) -> list[list[Any]]:
+        return [[without_folders(str(path), self.home), self._hash(path)] for path in stage.files]
 
     def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, StageRecord]) -> str:
         """Hash of the current inputs of a stage; ``built_on`` are the records of the stages that it reads."""

@@ -124,10 +124,10 @@ class Pipeline:
         arguments = {**stage.arguments, **listed}
         made_from, kept = self.ledger.made_from(stage, arguments), self.ledger.finished(stage)
         key = self.ledger.key(stage, made_from, records)
+        self._keys[stage.name] = key, made_from
         current = kept is not None and kept.key == key
         reusable = kept is not None and current and not kept.result.retry and not stage.is_one_of(self._force)
         if requested and not reusable:
-            self._keys[stage.name] = key, made_from
             return arguments
         if kept is None:
             reason = self.ledger.reason(stage) or f"{_NOT_RUN}it has no result and was not requested."
@@ -196,6 +196,20 @@ class Pipeline:
         for line in outcome.result.lines:
             log(f"    {line}")
 
+    def recheck(self, log: Log) -> None:
+        """Mark the results of which an input changed while the study ran, and those that depend on them."""
+        for stage in self.stages:  # in the order of dependencies
+            outcome = self.outcomes[stage.name]
+            if outcome.record is None or outcome.reason:
+                continue
+            unchanged = self.ledger.are_unchanged(stage, self._keys[stage.name][1])
+            reason = (
+                self._outdated_inputs(stage) if unchanged else "An input changed while the study ran; run it again."
+            )
+            if reason:
+                self.outcomes[stage.name] = replace(outcome, reason=reason)
+                log(str(self.outcomes[stage.name]))
+
     def _recorded(self, stage: Stage, result: StageResult | str, seconds: float) -> StageOutcome:
         if isinstance(result, str):
             failed = self._failed(stage, result)
@@ -243,6 +257,9 @@ def run_all(
             prefix = prefixes[name]
             pipelines[prefix].end(name.removeprefix(prefix), result, seconds, logs[prefix])
             begin(prefix)
+        if runners:
+            for prefix, pipeline in pipelines.items():
+                pipeline.recheck(logs[prefix])
 
 
 def _missing(stage: Stage, available: Collection[str]) -> str:

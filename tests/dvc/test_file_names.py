@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
+import dvc
 import fe
 from dvc.errors import InputError
 from dvc.file_names import as_file_name, clash
@@ -54,6 +56,20 @@ def test_a_load_of_a_study_file_is_named_with_its_line(tmp_path: Path, name: str
     (tmp_path / "study.toml").write_text(text)
     with pytest.raises(InputError, match=r"used as a folder name|too long for a folder name|reserved on Windows"):
         read_study(tmp_path)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.parametrize(
+    "read", [dvc.read_image, dvc.read_mesh, dvc.read_displacement, read_study, fe.read_material_sets, fe.read_curves]
+)
+def test_a_pipe_or_device_is_refused_before_it_is_read(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    """A command waited for a pipe that nobody writes to, without a word and without end."""
+    os.mkfifo(tmp_path / "a.nii.gz")
+    (tmp_path / "link.nii.gz").symlink_to("a.nii.gz")
+    for path in (tmp_path / "a.nii.gz", tmp_path / "link.nii.gz", Path("/dev/zero")):
+        with pytest.raises(InputError, match=rf"^{path}: a pipe or device, not a file\. Save"):
+            read(path)
 
 
 def test_a_comparison_removes_no_folder_that_its_record_names_elsewhere(tmp_path: Path) -> None:

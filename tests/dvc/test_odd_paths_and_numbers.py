@@ -90,6 +90,8 @@ def test_the_longest_name_is_that_of_most_bytes() -> None:
     with pytest.raises(InputError, match="a name of 400 bytes"):
         refuse_path("é" * 200 + "/" + "a" * 201)
     refuse_path("\ud800")
+    with pytest.raises(InputError, match="is empty"):  # Path makes the current folder of it
+        refuse_path("")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="paths are Unicode there")

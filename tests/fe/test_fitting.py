@@ -184,6 +184,15 @@ def test_curves_that_tell_nothing_are_refused() -> None:
         fit([curve_of(fat, np.full(20, 1.2))], "Isihara")
     with pytest.raises(InputError, match="0 at every point"):
         fit([Curve("uniaxial", stretch, np.zeros(20))], "neo-Hooke")
+    # each of these ended in a traceback
+    for odd, told in (
+        (1e200, r"have 0\.8 to 1e\+200"),
+        (1e-200, r"have 1e-200 to 1\.17895"),
+    ):
+        with pytest.raises(InputError, match=rf"Stretches must be between 0\.01 and 100; the curves {told}"):
+            fit([Curve("uniaxial", np.array([*stretch[:-1], odd]), stretch - 1.0)], "Ogden")
+    with pytest.raises(InputError, match=r"A stress of 2e\+299 MPa is beyond any tissue"):
+        fit([Curve("uniaxial", stretch, 1e300 * (stretch - 1.0))], "Ogden")
     with pytest.raises(InputError, match="has the wrong sign"):
         fit([Curve("uniaxial", stretch, -(stretch - 1))], "neo-Hooke")
     with pytest.raises(InputError, match="Poisson's ratio must be between 0 and"):

@@ -11,7 +11,7 @@ from dvc.images.image import Grid, LabelMap
 from dvc.io.images.write import write_labels
 from dvc.mesh import TetMesh
 from fe import mesh_labels, read_tet_mesh, write_tet_mesh
-from fe.meshing import _guessed
+from fe.meshing import _guessed, check_meshing
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.tissue_surfaces import borders_of, labels_at, thinned
 from mrstrain.models.mesh import Meshed
@@ -185,8 +185,9 @@ def test_what_cannot_be_meshed_is_refused() -> None:
         mesh_labels(labels, 4.0, bones=("calcaneus",))
     with pytest.raises(InputError, match="no soft tissue"):
         mesh_labels(labels, 4.0, bones=("bone", "fat", "skin"))
-    with pytest.raises(InputError, match="finer edge length"):
-        mesh_labels(labels, 4.0, finer=("skin", 6.0))
+    for edge in (6.0, 0.001, -1.0):  # .001 mm filled the memory before it reached the time limit
+        with pytest.raises(InputError, match="finer edge length must be between a quarter of a voxel"):
+            check_meshing(labels, 4.0, ("bone",), ("skin", edge))
 
 
 def test_meshing_that_does_not_end_is_ended() -> None:

@@ -32,8 +32,8 @@ def read_frd(path: Path) -> RawMesh:
     """Read a result file: its regions are the materials ("material 1"), its field the last step's displacement.
 
     CalculiX expands shells, membranes and beams to solids. They are left out if the deck lies beside the result, with
-    its name, and lists them; of elements that it does not list, those with node numbers of a shell are told. Both are
-    logged.
+    its name, and lists them; of elements that it does not list, those with node numbers of a shell or of a linear beam
+    are told. Both are logged.
     """
     try:
         text = path.read_text(encoding="ascii")
@@ -118,15 +118,15 @@ def _add_elements(
         if shape in _LAYERS and number in others:
             left_out += 1
             continue
-        alike += number not in solids and _like_a_shell(shape, nodes, mesh)
+        alike += number not in solids and (_like_a_shell(shape, nodes, mesh) or _like_a_beam(shape, nodes, mesh))
         mesh.add_element(number, shape, nodes)
         materials.setdefault(f"material {int(head[23:28])}", []).append(number)
     if left_out:
         _log.info("%s: %d shells, membranes or beams, expanded to solids, are left out.", mesh.path, left_out)
     if alike:
         _log.warning(
-            "%s: %d elements may be shells that CalculiX expanded to solids, and count as tissue. To have them "
-            "recognised, put the input deck with them (%s) next to the result, or write the result with OUTPUT=2D.",
+            "%s: %d elements may be shells or beams that CalculiX expanded to solids, and count as tissue. To have "
+            "them recognised, put the input deck with them (%s) next to the result, or write it with OUTPUT=2D.",
             mesh.path, alike, mesh.path.with_suffix(".inp").name,
         )  # fmt: skip
 
@@ -136,6 +136,15 @@ def _like_a_shell(shape: str, nodes: list[int], mesh: NumberedMesh) -> bool:
     low, high = _LAYERS.get(shape, (0, 0))
     pairs = [*zip(nodes[low:high], nodes[high : 2 * high - low], strict=False)]
     return bool(pairs) and all(above == below + 2 and below + 1 not in mesh.nodes for below, above in pairs)
+
+
+def _like_a_beam(shape: str, nodes: list[int], mesh: NumberedMesh) -> bool:
+    """Whether nodes have the numbers of a linear beam's: at each end four of eight, the other four not in the file."""
+    if shape != "hexahedron":
+        return False
+    first = sorted(nodes)
+    ends = (first[:4], first[4:])
+    return all(end[3] == end[0] + 3 and not any(end[3] + n in mesh.nodes for n in range(1, 5)) for end in ends)
 
 
 def _solids_and_others(deck: Path) -> tuple[set[int], set[int]]:

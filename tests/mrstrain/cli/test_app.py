@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -49,6 +52,21 @@ def test_what_is_missing_is_told_with_what_it_is(given: list[str], told: str) ->
     ran = CliRunner().invoke(app, ["register", *given])
     assert ran.exit_code == 2
     assert told in ran.output
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["a", "b", "--out", ""], "The value of --out is empty."),
+        (["a", "b", "--out="], "The value of --out is empty."),
+        (["a", "", "--out", "c"], "An argument is empty."),
+    ],
+)
+def test_an_empty_value_is_refused(given: list[str], told: str) -> None:
+    """It was taken for the current folder, in which results replaced folders of their names."""
+    ran = CliRunner().invoke(app, ["register", *given])
+    assert ran.exit_code == 2
+    assert f"{told} If it is a variable of the shell, it is not set." in ran.output
 
 
 @pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"doctor"}))  # which takes nothing
@@ -113,3 +131,16 @@ def test_directions_are_explained_where_they_are_asked_for(name: str) -> None:
 def test_a_simulation_says_nothing_of_elastix() -> None:
     assert "elastix" not in HELP["simulate"]
     assert "elastix reproduces" in " ".join(HELP["register"].split())
+
+
+def test_settings_for_other_programs_do_not_stop_a_command(tmp_path: Path) -> None:
+    """With each of these, numba or matplotlib could not be imported, which ended in a traceback."""
+    (tmp_path / "curve.csv").write_text("stretch,nominal_stress_kpa\n1,0\n1.1,1\n1.2,2.2\n1.3,3.6\n1.4,5.4\n")
+    given = ["curve.csv", "--law", "neo-Hooke", "--test", "uniaxial", "--out", "a"]
+    ran = subprocess.run(
+        [sys.executable, "-m", "mrstrain", "fit", *given],
+        env=os.environ | {"NUMBA_NUM_THREADS": "0", "MPLBACKEND": "nonsense"},
+        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100,
+    )  # fmt: skip
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert (tmp_path / "a" / "fit.png").exists()

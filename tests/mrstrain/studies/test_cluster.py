@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import signal
@@ -9,9 +10,11 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,12 +25,34 @@ from distributed.protocol import ToPickle, dumps
 from filelock import FileLock
 
 from dvc.errors import InputError
-from mrstrain.studies.cluster import StageRunner, cluster
+from mrstrain.studies.cluster import _WORKER, StageRunner, cluster
 from mrstrain.studies.run import run
 from mrstrain.studies.scheduler import _refuse_unencrypted
 from tests.processes import cluster_of, wait_for
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
+
+
+def test_where_one_worker_cannot_start_the_others_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For want of memory; a run told so, and then waited without end for the worker that had started."""
+    begun = list[BaseProcess]()
+
+    def made(**_: object) -> None:
+        name = "Dask Worker process (from Nanny)"  # as Dask calls it
+        begun.append(multiprocessing.get_context("spawn").Process(name=name, target=time.sleep, args=(600.0,)))
+        begun[0].start()
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr("mrstrain.studies.cluster.LocalCluster", made)
+    with pytest.raises(RuntimeError, match="Nanny failed"), cluster(lambda *_: None, [tmp_path], workers=2):
+        pass
+    begun[0].join(20.0)
+    assert begun[0].exitcode == -signal.SIGKILL
+
+
+def test_a_worker_is_called_as_dask_calls_it(tmp_path: Path) -> None:
+    with cluster(lambda *_: None, [tmp_path], workers=1):
+        assert any(child.name.startswith(_WORKER) for child in multiprocessing.active_children())
 
 
 @pytest.mark.parametrize(

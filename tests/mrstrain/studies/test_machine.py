@@ -125,12 +125,11 @@ def test_a_second_attempt_counts_on_one_core(tmp_path, monkeypatch, alone):
 
 @pytest.mark.full_size
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
-@pytest.mark.parametrize(("mib", "ends"), [(700, 2), (900, 2), (1300, 0)])
+@pytest.mark.parametrize(("mib", "ends"), [(700, {2}), (900, {2}), (1000, {1, 2}), (1300, {0})])
 def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, ends):
-    """Address space is lacking for the command, then for its workers, then for nothing.
+    """Address space is lacking for the command, then for its workers, for some of them, then for nothing.
 
-    Its libraries alone take 850 MiB. With some 50 MiB less, OpenBLAS ends it with a message and status of its own; with
-    1,000 MiB a worker may wait for a thread that it never gets.
+    Its libraries alone take 850 MiB. With some 50 MiB less, OpenBLAS ends it with a message and status of its own.
     Dask and loky may print tracebacks of their own where they get no thread; none comes from mrstrain.
     """
     shutil.copytree(images, tmp_path / "study")
@@ -140,8 +139,8 @@ def test_a_study_without_enough_memory_names_it_and_ends(images, tmp_path, mib, 
         capture_output=True, text=True, check=False, timeout=500,
     )  # fmt: skip
     said = told.stdout + told.stderr
-    assert told.returncode == ends
-    if not ends:
+    assert told.returncode in ends
+    if not told.returncode:
         return
     assert "The memory ran out" in said
     assert "fewer --workers" in said.replace("\n", " ")

@@ -115,6 +115,30 @@ def test_changed_content_of_the_same_size_is_done_again_and_what_builds_on_it(fo
     assert '"z"' in (folder / "results" / "compare").read_text().replace("\\", "")
 
 
+@pytest.mark.parametrize("gone", [False, True])
+def test_an_input_that_changes_under_a_run_is_named(folder, monkeypatch, gone):
+    """Later stages read what earlier ones had not, and the report was one of both, marked as up to date."""
+
+    class Changing(Here):
+        def next(self) -> tuple[str, StageResult | str, float]:
+            ended = super().next()
+            if ended[0] == "compare":
+                (folder / "a.txt").unlink() if gone else (folder / "a.txt").write_text("z")
+            return ended
+
+    with monkeypatch.context() as changed:
+        changed.setitem(globals(), "Here", Changing)
+        _, outcomes, told = ran(folder)
+    status = {name: outcome.status for name, outcome in outcomes.items()}
+    assert status == dict.fromkeys(ALL, "done") | {"register a": "OUT OF DATE", "compare": "OUT OF DATE"}
+    assert "register a: OUT OF DATE. An input changed while the study ran; run it again." in told
+    assert "compare: OUT OF DATE. It depends on results that are out of date: register a." in told
+    (folder / "a.txt").write_text("z")
+    again, outcomes, _ = ran(folder)
+    assert again == ["register a", "compare"]
+    assert all(outcome.complete for outcome in outcomes.values())
+
+
 def test_a_new_number_is_done_again_and_what_builds_on_it(folder):
     ran(folder)
     assert ran(folder, number=2)[0] == ["mesh", "simulate a", "simulate b", "compare"]
