@@ -14,6 +14,7 @@ import pytest
 
 from dvc.images.image import Grid, LabelMap
 from dvc.io.images.write import write_image, write_labels
+from tests.mrstrain.studies import checked_study
 from tests.planted import plant_in_nifti
 from tests.processes import stages_run_here
 
@@ -110,3 +111,9 @@ def folder(tmp_path):
     for name in ("a", "b", "labels"):
         (tmp_path / f"{name}.txt").write_text(name)
     return tmp_path
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """A study that `check` looks at, as `checked_study.written` writes it."""
+    return checked_study.written(tmp_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,50 +23,7 @@ from mrstrain.studies.plan import plan
 from mrstrain.studies.run import forecast, run
 from tests.fe.test_simulate import dome
 from tests.mrstrain.comparison.test_model_files import model
-
-GRID = Grid((16, 16, 16), (2.0, 2.0, 2.0), (-6.0, -6.0, -6.0))  # around the dome
-STUDY = """
-[study]
-name = "Heel"
-[images]
-load0 = "Load0.nii.gz"
-labels = "tissues.nii.gz"
-names = "tissues.csv"
-[loads.Load1]
-image = "Load1.nii.gz"
-normal_n = 15.0
-shear_n = 4.0
-[plate]
-normal = [-1.0, 0.0, 0.0]
-[registration]
-[mesh]
-[models]
-sets = ["mine.toml", "friedman"]
-"""
-MINE = '[mine]\n[mine.fat]\nlaw = "neo-Hooke"\nmu_kpa = 10.0\nnu = 0.49\n'
-
-
-@pytest.fixture
-def study(tmp_path: Path) -> Path:
-    """Two images of noise, a label map of bone, fat and tendon, and a set that has a law for fat alone."""
-    rng = np.random.default_rng(1)
-    for name in ("Load0", "Load1"):
-        write_image(tmp_path / f"{name}.nii.gz", Image(GRID, rng.uniform(0.0, 100.0, GRID.shape)))
-    values = np.ones(GRID.shape, dtype=np.int64)
-    values[:4], values[4:6] = 2, 3
-    write_labels(tmp_path / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 3: "tendon", 9: "skin"}))
-    (tmp_path / "mine.toml").write_text(MINE)
-    (tmp_path / "study.toml").write_text(STUDY)
-    return tmp_path
-
-
-def wrong(folder: Path, *changes: tuple[str, str]) -> str:
-    text = STUDY
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "study.toml").write_text(text)
-    return "\n".join(check(folder).wrong)
+from tests.mrstrain.studies.checked_study import GRID, STUDY, wrong
 
 
 def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study):

@@ -15,10 +15,7 @@ from mrstrain.studies import costs
 from mrstrain.studies.file import read_study
 from mrstrain.studies.plan import Stage, plan
 from mrstrain.studies.run import _tell
-from tests.mrstrain.studies import test_check
-from tests.mrstrain.studies.test_check import GRID, MINE, STUDY
-
-study = test_check.study  # a fixture
+from tests.mrstrain.studies.checked_study import GRID, MINE, STUDY
 
 
 def test_larger_images_and_meshes_take_longer_and_more_memory(study):
