@@ -22,9 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.before_after import run
-from dvc import Settings, tissue_mask, write_image, write_labels, write_mask
+from dvc import AlignedPair, Settings, tissue_mask, write_image, write_labels, write_mask
 from dvc.registration.elastix import run as elastix
-from dvc.registration.engine import AlignedPair
 from dvc.worker import Worker
 from mrstrain.records.provenance import versions
 from phantoms import HeelPair, heel_pair

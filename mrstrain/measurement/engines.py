@@ -1,9 +1,16 @@
 """The engine that a command registers with, by the flat options that it was asked with."""
 
-from dvc import Elastix, Engine, load_preset, read_parameter_file
+from dvc import (
+    Elastix,
+    Engine,
+    GaussNewton,
+    GaussNewtonAtBone,
+    GaussNewtonWithInterfaces,
+    load_preset,
+    read_parameter_file,
+)
 from dvc.errors import InputError, ParameterError
 from dvc.registration.engines import DEFAULT, ENGINES
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 
