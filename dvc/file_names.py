@@ -38,7 +38,7 @@ def refuse_path(path: str | os.PathLike[str]) -> None:
     """
     text = os.fspath(path)
     if not text:
-        raise InputError("The path of a file or folder is empty.")
+        raise InputError("The path of a file or folder is empty. Give one.")
     if "\0" in text:
         raise InputError(f"{text!r} has a null character (\\u0000), which no path has. Type it again.")
     sizes = {part: len(part.encode(errors="replace")) for part in text.split(os.sep)}
