@@ -52,7 +52,7 @@ def refuse_path(path: str | os.PathLike[str]) -> None:
     except (OSError, ValueError):  # there is none, which whoever reads it says
         return
     if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-        raise InputError(f"{text}: a pipe or device, not a file. Save what it yields as a file, and give that one.")
+        raise InputError(f"{text}: a pipe or device. Give a regular file or a folder.")
 
 
 def is_utf8(path: os.PathLike[str]) -> bool:

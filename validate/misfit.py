@@ -27,6 +27,7 @@ _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
 _FAR_MM = 50.0  # no plate that presses soft tissue moves the bone so far: a seat sinks into a buttock by 2 to 4 cm
 _ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 _SAME_PLACE_MM = 1e-6
+_FEWEST_POINTS, _IN_LINE = 4, 0.01  # the latter of their spread along the longest axis
 _RIGID_SHARE = 0.1  # of a displacement, what it has beside a rigid motion if that is all that there is to it
 
 
@@ -175,8 +176,17 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
     return [Misfit("", result.name, f"{result.name}: {told}", level) for level, of in levels.items() for told in of]
 
 
-def _strains_alike(points: FloatArray, weight: FloatArray, u: FloatArray, v: FloatArray, turned: FloatArray) -> bool:
-    """Whether ``u`` agrees with ``turned`` better than with ``v`` where the rigid motion of each is removed."""
+def _strains_alike(
+    points: FloatArray, weight: FloatArray, u: FloatArray, v: FloatArray, turned: FloatArray
+) -> bool | None:
+    """Whether ``u`` agrees with ``turned`` better than with ``v`` where the rigid motion of each is removed.
+
+    None where too little is left to tell, or a few points or points in a line leave a rotation free.
+    """
+    away = (points - weight @ points) * np.sqrt(weight)[:, None]
+    spread = np.linalg.svd(away, compute_uv=False)
+    if len(points) < _FEWEST_POINTS or spread[1] <= _IN_LINE * spread[0]:
+        return None
 
     def left(w: FloatArray) -> FloatArray:
         before, after = points - weight @ points, points + w - weight @ (points + w)
@@ -186,7 +196,7 @@ def _strains_alike(points: FloatArray, weight: FloatArray, u: FloatArray, v: Flo
     of_measured, as_stored, as_turned = map(left, (u, v, turned))
     for whole, part in ((u, of_measured), (v, as_stored)):
         if np.linalg.norm(part) <= _RIGID_SHARE * np.sqrt(weight @ (whole**2).sum(axis=1)):
-            return False
+            return None
     stored, other = ((of_measured * of).sum() / np.linalg.norm(of) for of in (as_stored, as_turned))
     return bool(other > stored)
 
@@ -206,8 +216,8 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
 
     A rigid motion in the model, such as that of the plate or of the bone, lies along axes of its own, and another order
     or sign may turn it towards the measured displacement. Other axes are therefore only named if, without the nearest
-    rigid motion of each, u and v also agree better with them than as stored, and if more than a tenth of each is left.
-    Otherwise the rigid motion is named.
+    rigid motion of each, u and v also agree better with them than as stored; otherwise the rigid motion is named. Both
+    are named if a tenth of u or v or less is left.
     """
     where = fields.common
     weight = fields.volumes_ml[where] / fields.volumes_ml[where].sum()
@@ -226,14 +236,20 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
     tied = (axes for axes, cosine in cosines.items() if cosine > most - _TIED)
     order, signs = min(tied, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
     turned = most >= _ALONG and as_given < _TURNED * most
-    if turned and not _strains_alike(fields.points_mm[where], weight, u, v, v[:, order] * signs):
+    axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
+    axes += " (LPS and RAS exchanged)" if axes == "-x -y z" else ""
+    alike = _strains_alike(fields.points_mm[where], weight, u, v, v[:, order] * signs) if turned else None
+    if turned and alike is None:
+        warnings.append(
+            f"differs in direction from the measured one (cosine {as_given:z.2f}), by a rigid motion or by its axes "
+            f"(in the order {axes} the cosine is {most:.2f}); check both"
+        )
+    elif turned and not alike:
         warnings.append(
             f"differs in direction from the measured one (cosine {as_given:z.2f}) by a rigid motion, not by its axes; "
             "remove the rigid motion of the bone from the model"
         )
     elif turned:
-        axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
-        axes += " (LPS and RAS exchanged)" if axes == "-x -y z" else ""
         warnings.append(
             f"fits the measured one far better with its components as {axes} (cosine {most:.2f}, as given "
             f"{as_given:z.2f}); check its frame and the order of its components"

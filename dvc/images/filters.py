@@ -76,7 +76,7 @@ def _across_lines(values: Float32Array, weights: Float32Array, taken: IntArray, 
                 onto[k] = weight * line[k]
             for t in range(reach):  # a line before and one after: half as many sums are written
                 first, last = taken[j + t], taken[j + 2 * reach - t]
-                one, other = values[i, max(first, 0)], values[i, max(last, 0)]
+                one, other = values[i, first if first >= 0 else j], values[i, last if last >= 0 else j]
                 low = weights[t] if first >= 0 else np.float32(0.0)
                 high = weights[2 * reach - t] if last >= 0 else np.float32(0.0)
                 for k in range(onto.size):

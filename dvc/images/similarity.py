@@ -32,7 +32,9 @@ class Windows:
 
     def structure(self, image: Float32Array) -> "Structure":
         """An image (ni, nj, nk) as the windows see it."""
-        values = np.where(self.known, image[self.box], 0.0).astype(np.float32)
+        seen = image[self.box].astype(np.float64)
+        centre = float(seen[self.known].mean()) if self.known.any() else 0.0  # a large one would cost digits
+        values = np.where(self.known, seen - centre, 0.0).astype(np.float32)
         scale = max(float(values.std()), 1e-12)
         values = values / scale
         mean = self.mean(values)

@@ -8,7 +8,8 @@ from dvc.arrays import BoolArray
 from dvc.trust.components import ComponentUncertainty
 from dvc.trust.uncertainty import Uncertainty
 
-_SKIN, _TENDON, _NO_INTERFACES = "skin", "tendon", "gauss-newton"
+_SKIN, _TENDON = "skin", "tendon"
+_NO_INTERFACES = "gauss-newton", "gauss-newton-bone"  # at the skin
 _OF_SKIN = (
     "No standard uncertainty of the max. shear in skin: without strain discontinuities at tissue interfaces, it "
     "covered only 83 % of the voxels where the fat pad slides."
@@ -34,7 +35,7 @@ def without_gaps(known: Uncertainty, engine: str, *, labels_from_image: bool) ->
     skin, tendon = (
         {name: inside for name, inside in known.regions.items() if name.lower() == of} for of in (_SKIN, _TENDON)
     )
-    if skin and engine == _NO_INTERFACES:
+    if skin and engine in _NO_INTERFACES:
         known = replace(known, sigma=np.where(_any(skin), np.float32(np.nan), known.sigma))
         reasons.append(_OF_SKIN)
     if tendon and known.components is not None:

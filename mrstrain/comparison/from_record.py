@@ -71,8 +71,12 @@ def fill_subject(given: _F, record: MeasuredWith) -> _F:
     return given.model_copy(update=update)
 
 
-def fill_engine(given: _E, record: MeasuredWith) -> _E:
-    """The engine of a registration: as given, or that of the measurement; errors as `MeasuredWith.find`."""
+def fill_engine(given: _E, record: MeasuredWith, *, labelled: bool) -> _E:
+    """The engine of a registration: as given, or that of the measurement; errors as `MeasuredWith.find`.
+
+    Whether it is ``labelled`` now decides what its engine is by default. InputError where labels are given now that the
+    measurement did without.
+    """
     if given.engine or given.preset or given.parameters:
         return given
     how = record.parameters
@@ -80,9 +84,14 @@ def fill_engine(given: _E, record: MeasuredWith) -> _E:
     if family == ELASTIX:
         return given.model_copy(update=_elastix(record))
     if family == GAUSS_NEWTON and given.borders is None:
-        labelled, borders = "labels" in record.inputs, how.get("borders") is not None
-        if labelled != borders:  # not what it is by default
-            return given.model_copy(update={"borders": borders})
+        borders = how.get("borders")
+        if labelled and "bone_alone" in (borders or {}):
+            raise InputError(
+                f"{record.path}: the bone's surface was the only tissue interface of this measurement. Leave the label "
+                "map out (labels), so that the model is measured in the same way."
+            )
+        if labelled != (borders is not None):  # not what it is by default
+            return given.model_copy(update={"borders": borders is not None})
     return given.model_copy(update={"engine": family}) if family not in (None, DEFAULT) else given
 
 

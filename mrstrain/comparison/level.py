@@ -130,7 +130,8 @@ def _from_record(
     load0 = record.file("load0", instead)
     if load0 is None:
         raise InputError(f"{record.path} does not name the unloaded image. Give {instead}.")
-    of_subject, of_engine = fill_subject(files, record), fill_engine(engine, record)
+    of_subject = fill_subject(files, record)
+    of_engine = fill_engine(engine, record, labelled=of_subject.labels is not None)
     taken = taken_from_record(dvc, (files, of_subject), (engine, of_engine), more=[str(load0)])
     return load0, of_subject, of_engine, taken
 

@@ -163,7 +163,8 @@ def level(tell: Tell, *, load0: Path, model: Path, load: str, **options: Any) ->
     """Forward-model comparison of one model and load; as `mrstrain.level`."""
     from mrstrain.comparison.level import level as run
 
-    whole = _whole(tell, usual_registration(_engine(options).cost))
+    engine = _engine(options | {"allow_unknown_parameters": True})
+    whole = _whole(tell, usual_registration(engine.cost))
     done = run(load0, model, loads=[load], threads=1, progress=lambda _, *stage: whole(*stage), **options)
     return StageResult(tuple(done.summary()[:-1]))
 

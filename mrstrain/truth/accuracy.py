@@ -47,15 +47,17 @@ def accuracy_cases(
     """Every preset with every condition (voxel in mm, SNR), motion and seed; shear waves with the first seed only.
 
     By default nine motions with two heels each and eight waves, at five conditions: 130 registrations. For an engine
-    that needs labels these are exact, too large and too small in turn, and there are no waves, which move bone as they
-    move tissue.
+    that needs labels these are exact, too large and too small in turn. Waves, which move bone as they move tissue, are
+    left out for an engine that keeps the bone rigid.
     """
     return [
-        AccuracyCase(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if labelled else 0)
-        for preset, labelled in [(preset, engine_named(preset).needs_labels) for preset in presets]
+        AccuracyCase(
+            preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if engine.needs_labels else 0
+        )
+        for preset, engine in [(preset, engine_named(preset)) for preset in presets]
         for spacing, snr in conditions
         for m, motion in enumerate(motions)
-        if not (labelled and motion.startswith("wave-"))
+        if not ((engine.needs_labels or engine.needs_bone) and motion.startswith("wave-"))
         for s, seed in enumerate(seeds[:1] if motion.startswith("wave-") else seeds)
     ]
 
@@ -101,7 +103,7 @@ def accuracy(
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
             "Give at least one case, and each only once. Wave motions also deform bone, so they cannot be used with an "
-            "engine that needs labels (gauss-newton-borders)."
+            "engine that keeps it rigid (gauss-newton-borders, gauss-newton-bone)."
         )
     for case in wanted:
         _check(case)

@@ -68,7 +68,7 @@ def test_a_pipe_or_device_is_refused_before_it_is_read(tmp_path: Path, read: Cal
     os.mkfifo(tmp_path / "a.nii.gz")
     (tmp_path / "link.nii.gz").symlink_to("a.nii.gz")
     for path in (tmp_path / "a.nii.gz", tmp_path / "link.nii.gz", Path("/dev/zero")):
-        with pytest.raises(InputError, match=rf"^{path}: a pipe or device, not a file\. Save"):
+        with pytest.raises(InputError, match=rf"^{path}: a pipe or device"):
             read(path)
 
 

@@ -49,18 +49,23 @@ class Choice(Regularisation):
         return f"{relaxed} Only the gradient of the volume change was penalised ({self.weights.volume_gradient:g}/mm)."
 
     @property
+    def _rigid(self) -> str | None:
+        """What resists strain; None where the bone cannot be strained, and there is no skin."""
+        return None if self.at_interfaces and self.weights.rigidity == 0.0 else _RIGID[self.at_interfaces]
+
+    @property
     def caption(self) -> str:
         """The rules by which the weights were chosen."""
         return f"{self.rule[:1].upper()}{self.rule[1:]}. {self.volume_told}"
 
     def rows(self) -> list[tuple[str, float, str, str | float]]:
         """Each weight: what it penalises, its value, its unit, and "used" or what it left out, % above the least."""
-        stiff = f"strain of {_RIGID[self.at_interfaces]}"
+        stiff = f"strain of {self._rigid}"
         return [
             ("bending", self.weights.bending, "1/mm", "used"),
             ("volume change in soft tissue", self.weights.volume, "1/mm3", "used"),
             ("gradient of the volume change", self.weights.volume_gradient, "1/mm", "used"),
-            (stiff, self.weights.rigidity, "1/mm3", "used"),
+            *([(stiff, self.weights.rigidity, "1/mm3", "used")] if self._rigid else []),
             *(("bending", weight, "1/mm", 100.0 * (left - 1.0)) for weight, left in self.tried),
             *((stiff, weight, "1/mm3", 100.0 * (left - 1.0)) for weight, left in self.tried_in_skin),
         ]
@@ -71,7 +76,7 @@ class Choice(Regularisation):
         skin = [{"rigidity": weight, "left_out_over_best": round(left, 6)} for weight, left in self.tried_in_skin]
         return {
             "weights": asdict(self.weights),
-            "rigidity_of": _RIGID[self.at_interfaces],
+            "rigidity_of": self._rigid,
             "rule": self.rule,
             "tried": [{"bending": weight, "left_out_over_best": round(left, 6)} for weight, left in self.tried],
             "change_of_volume": {"rule": self.volume_told, "asked": asked, "allowed_above": above},

@@ -236,9 +236,9 @@ class GaussNewtonAtBone(Engine):
         return json.dumps(json.loads(self.smooth.text) | {"borders": {_AT_BONE: STAGE_AT_BONE}})
 
     @property
-    def without_error_model(self) -> str:
-        """Why there is no error model for it yet."""
-        return f"The error of {self.name} has not been measured yet, so there are no error bars."
+    def unlike_its_error_model(self) -> str:
+        """Why the error model of this name is not valid, if it was made with other parameters."""
+        return _unlike(self.name, self.smooth)
 
     def of_repeat(self) -> Self:
         """With the default weights: weights chosen for a pair without strain would smooth away the noise floor."""
@@ -265,12 +265,13 @@ class GaussNewtonAtBone(Engine):
 
     def prepare(self) -> None:
         """Compile the loops, if no run has done so before."""
-        compile_loops(lambda pair: fit_with_interfaces(pair, self.smooth))
+        compile_loops(lambda pair: fit_with_interfaces(replace(pair, labels=None), self.smooth))
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
     ) -> Found:
         """Find the displacement between the images of a pair; as in `Engine`. InputError without a bone."""
+        pair = replace(pair, labels=None)
         displacement, choice = _run(fit_with_interfaces, pair, (self.smooth, None), start, worker, progress)
         return Found(displacement, choice, _volume_freed(self.name, choice))
 

@@ -42,6 +42,15 @@ def test_gaussians_are_those_of_scipy(shape, dtype, count):
         np.testing.assert_allclose(gaussian(values, 1.0, order=order), expected, rtol=0.0, atol=2e-6)
 
 
+def test_a_missing_value_spreads_no_farther_than_the_gaussian_reaches():
+    values = np.zeros((30, 30, 30), np.float32)
+    values[0, 0, 0] = np.nan
+    for mode in ("constant", "nearest", "reflect"):
+        reached = np.isnan(gaussian(values, 1.0, mode))
+        assert np.count_nonzero(reached) == 5**3
+        assert reached[:5, :5, :5].all()
+
+
 def test_gaussians_do_not_depend_on_the_number_of_threads():
     values, before = values_of(SHAPES[0], np.float32), threads.count()
     try:

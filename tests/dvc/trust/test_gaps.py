@@ -33,6 +33,7 @@ def known() -> Uncertainty:
         ("gauss-newton-borders", False, {"components in tendon"}),
         ("gauss-newton-borders", True, {"components in tendon", "intervals in Skin"}),
         ("gauss-newton", False, {"components in tendon", "voxels in Skin"}),
+        ("gauss-newton-bone", False, {"components in tendon", "voxels in Skin"}),
     ],
 )
 def test_what_holds_too_few_true_values_is_left_out_with_a_reason(known, engine, from_image, lacking) -> None:

@@ -199,6 +199,15 @@ def test_noise_floor_is_the_mean_and_spread_of_the_mean_absolute_component():
     assert floor.max_shear_p95 == pytest.approx((1.2**2 - 1) / 4, rel=1e-6)
 
 
+def test_local_correlation_is_blind_to_a_large_offset():
+    random = np.random.default_rng(2)
+    one = gaussian_filter(random.normal(size=GRID.shape), 1.0).astype(np.float32)
+    other = one + np.float32(0.1) * random.normal(size=GRID.shape).astype(np.float32)
+    _, expected = local_correlation(Image(GRID, one), other, core())
+    _, far = local_correlation(Image(GRID, one + np.float32(1e3)), other + np.float32(1e3), core())
+    assert far == pytest.approx(expected, abs=1e-4)
+
+
 def test_local_correlation_of_an_image_with_itself_is_one_and_is_blind_to_gain():
     random = np.random.default_rng(1)
     image = Image(GRID, random.normal(size=GRID.shape).astype(np.float32))

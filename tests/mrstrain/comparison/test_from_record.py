@@ -117,29 +117,34 @@ GAUSS_NEWTON = {"engine": "gauss-newton", "gauss_newton": {}, "stages": []}
 )
 def test_the_engine_is_that_of_the_measurement(folder: Path, recorded: dict, engine: dict) -> None:
     record = record_of(measured(folder, "labels", **recorded))
-    assert fill_engine(EngineOptions(), record) == EngineOptions.model_construct(**(dict(EngineOptions()) | engine))
+    assert fill_engine(EngineOptions(), record, labelled=True) == EngineOptions.model_construct(
+        **(dict(EngineOptions()) | engine)
+    )
     for given in (EngineOptions(engine="gauss-newton"), EngineOptions(preset="heel-mr")):
-        assert fill_engine(given, record) == given
+        assert fill_engine(given, record, labelled=True) == given
 
 
-def test_interfaces_are_left_out_only_where_a_label_map_was_measured_with(folder: Path) -> None:
-    """Without one there were none to leave out, and labels that are given now are used."""
-    record = record_of(measured(folder, "bone", **GAUSS_NEWTON, borders=None))
-    assert fill_engine(EngineOptions(), record) == EngineOptions()
+def test_a_model_is_measured_with_the_interfaces_of_the_measurement(folder: Path) -> None:
+    """Whether labels are given now or not: another engine has another bias."""
+    record, given = record_of(measured(folder, "bone", **GAUSS_NEWTON, borders=None)), EngineOptions()
+    assert fill_engine(given, record, labelled=False) == given
+    assert fill_engine(given, record, labelled=True) == EngineOptions(borders=False)
     record = record_of(measured(folder, "bone", **GAUSS_NEWTON, borders={"bone_alone": True}))
-    assert fill_engine(EngineOptions(), record) == EngineOptions(borders=True)
+    assert fill_engine(given, record, labelled=False) == EngineOptions(borders=True)
+    with pytest.raises(InputError, match="Leave the label map out"):
+        fill_engine(given, record, labelled=True)
     record = record_of(measured(folder, "labels", **GAUSS_NEWTON, borders=None))
-    assert fill_engine(EngineOptions(borders=True), record) == EngineOptions(borders=True)
+    assert fill_engine(EngineOptions(borders=True), record, labelled=True) == EngineOptions(borders=True)
 
 
 def test_parameter_files_are_found_by_their_text_with_line_ends_of_any_system(folder: Path) -> None:
     stages = [PRESET | {"name": "mine.txt"}]
     record = record_of(measured(folder, engine="elastix", stages=stages))
     (folder / "mine.txt").write_bytes(PRESET["text"].replace("\n", "\r\n").encode())
-    assert fill_engine(EngineOptions(), record) == EngineOptions(parameters=(folder / "mine.txt",))
+    assert fill_engine(EngineOptions(), record, labelled=True) == EngineOptions(parameters=(folder / "mine.txt",))
     (folder / "mine.txt").write_text("something else")
     with pytest.raises(InputError, match=r"mine.txt is not the elastix parameter file .* \(--parameters\)"):
-        fill_engine(EngineOptions(), record)
+        fill_engine(EngineOptions(), record, labelled=True)
 
 
 def test_what_was_taken_is_told_as_one_would_type_it() -> None:

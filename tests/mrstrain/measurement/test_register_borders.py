@@ -128,6 +128,7 @@ def test_the_bone_mask_alone_lets_strain_jump_at_the_bone(pad, tmp_path):
     assert isinstance(spline_in(folder), InterfaceSpline)
     told = json.loads((folder / "quality.json").read_text())
     assert "gauss-newton-bone has not been measured" in json.dumps(told["error_of_max_shear"])
+    assert told["regularisation"]["rigidity_of"] is None  # the bone cannot be strained
     record = json.loads((tmp_path / "True" / "provenance.json").read_text())["parameters"]
     assert record["borders"] == {"bone_alone": True}
     assert "vanishes on the surface of the bone" in methods_of(record, {})

@@ -57,6 +57,9 @@ def test_borders_are_studied_with_labels_that_are_right_too_large_and_too_small(
         assert {c.labels_off for c in with_borders if c.seed == seed} == {-1, 0, 1}
     assert {c.labels_off for c in cases if c not in with_borders} == {0}
     assert len({c.name for c in cases}) == len(cases)
+    at_bone = accuracy_cases(("gauss-newton-bone",))
+    assert {c.motion for c in at_bone} == set(MOTIONS)
+    assert {c.labels_off for c in at_bone} == {0}
 
 
 def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
