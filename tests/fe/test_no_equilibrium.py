@@ -15,7 +15,9 @@ from fe.linear import Solver
 from tests.fe.test_simulate import ALONG, DOWN, FAT, SKIN, dome
 
 MOST_STEPS, MINUTE = 1000, 60.0
-DOUBTED_STEPS = 250  # with a material that is told to be odd, for which smaller steps and viscous descent are not tried
+# With a material that is told to be odd, for which smaller steps and viscous descent are not tried: 122 to 256, and 411
+# to over 600 where they are. Rounding, which differs between processors, changes the numbers.
+DOUBTED_STEPS = 350
 FALLING = Yeoh.of(0.03, c20_mpa=-0.02)
 SOFT = NeoHooke.of(1e-5)  # 10 Pa
 FALLS = r"stable \(rising stress\) only at"
