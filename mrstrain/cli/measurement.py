@@ -141,7 +141,7 @@ def accuracy(
     preset: Annotated[
         list[str] | None,
         typer.Option(
-            help="Engine or elastix preset to test: gauss-newton, gauss-newton-borders (with labels), heel-mr, or an "
+            help="Engine or elastix preset to test: gauss-newton, gauss-newton-bone, gauss-newton-borders (with labels), heel-mr, or an "
             "elastix parameter file (.txt). Default: gauss-newton. Repeat for several."
         ),
     ] = None,

@@ -316,7 +316,9 @@ def test_settings_that_cannot_be_used_are_refused_when_they_are_made(given, told
 
 
 def test_an_engine_that_is_not_there_is_refused_with_those_that_are():
-    with pytest.raises(ParameterError, match="use gauss-newton, gauss-newton-borders, heel-mr, or an elastix"):
+    with pytest.raises(
+        ParameterError, match="use gauss-newton, gauss-newton-bone, gauss-newton-borders, heel-mr, or an elastix"
+    ):
         Settings.of("gauss")
 
 
