@@ -5,7 +5,6 @@ from scipy.ndimage import gaussian_filter
 
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image, LabelMap, Mask
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings, register
 
 _SIZE = 32  # voxels of 1 mm along each edge
@@ -22,8 +21,8 @@ def self_test() -> str:
     fixed, moving, labels = _tiny_pair()
     bone, body = labels.region("bone"), Mask(labels.grid, labels.labels > 0)
     X, shifts = body.points(), []
-    for engine in (GaussNewton(), GaussNewtonWithInterfaces()):
-        settings = Settings(engine, threads=1, align_on="image")
+    for name in ("gauss-newton", "gauss-newton-borders"):
+        settings = Settings.of(name, threads=1, align_on="image")
         found = register(fixed, moving, bone=bone, tissue=body, labels=labels, settings=settings)
         moved = found.alignment.motion.apply(X + found.deformation.displacement(X))
         shifts.append((moved - X).mean(axis=0))

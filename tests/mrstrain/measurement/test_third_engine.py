@@ -116,7 +116,7 @@ ENGINES_KNOWN_IN = {
     "dvc/registration/engines.py",
     "mrstrain/measurement/engines.py",  # options of the command line to an engine
 }
-CLASSES = {"GaussNewton", "GaussNewtonWithInterfaces", "Elastix"}
+CLASSES = {"GaussNewton", "GaussNewtonAtBone", "GaussNewtonWithInterfaces", "Elastix"}
 
 
 def test_no_other_file_knows_an_engine() -> None:
