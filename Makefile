@@ -63,7 +63,7 @@ $(VENV)/dependencies.stamp: requirements.lock
 	@"$(PYTHON)" -m venv --clear $(VENV)
 	@echo "Set-up 2 of 5: installing $$(grep -c == requirements.lock) packages (a minute or more, most of it downloads)"
 	@$(BIN)/python -m pip install $(WITH_PROGRESS) --no-compile --require-hashes --only-binary :all: -r requirements.lock
-	@echo "Set-up 3 of 5: compiling them (half a minute)"
+	@echo "Set-up 3 of 5: compiling these packages (half a minute)"
 	@$(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV) || true  # some have files that no Python can compile
 	@touch $@
 
@@ -71,7 +71,7 @@ $(VENV)/dependencies.stamp: requirements.lock
 $(VENV)/installed.stamp: $(VENV)/dependencies.stamp pyproject.toml
 	@echo "Set-up 4 of 5: installing mrstrain"
 	@$(BIN)/python -m pip install $(QUIETLY) --no-deps --no-build-isolation -e .
-	@echo "Set-up 5 of 5: compiling what a registration computes with, and trying it"
+	@echo "Set-up 5 of 5: compiling the registration code, and testing it on a tiny image pair"
 	@$(THREADS) $(BIN)/python -c 'from dvc.registration.self_test import self_test; print(self_test())'
 	@touch $@
 

@@ -241,13 +241,13 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
     alike = _strains_alike(fields.points_mm[where], weight, u, v, v[:, order] * signs) if turned else None
     if turned and alike is None:
         warnings.append(
-            f"differs in direction from the measured one (cosine {as_given:z.2f}), by a rigid motion or by its axes "
-            f"(in the order {axes} the cosine is {most:.2f}); check both"
+            f"has another direction than the measured one (cosine {as_given:z.2f}): it contains a rigid motion, or its "
+            f"axes are wrong (as {axes}, the cosine would be {most:.2f}); check first whether the bone moves"
         )
     elif turned and not alike:
         warnings.append(
-            f"differs in direction from the measured one (cosine {as_given:z.2f}) by a rigid motion, not by its axes; "
-            "remove the rigid motion of the bone from the model"
+            f"has another direction than the measured one (cosine {as_given:z.2f}), most likely because it contains a "
+            "rigid motion; if the bone moves in the model, subtract that motion"
         )
     elif turned:
         warnings.append(

@@ -1,7 +1,7 @@
 """Filters that go along one axis after the other, on all threads: Gaussians, and the coefficients of cubic splines.
 
 The coefficients are those of `scipy.ndimage.spline_filter`, bit for bit. Gaussians are those of
-`scipy.ndimage.gaussian_filter`, in single precision, which takes a fifth of its time or less. Along the first axis
+`scipy.ndimage.gaussian_filter`, in single precision, which takes a quarter to a sixth of its time. Along the first axis
 neighbours are far apart in memory, so a few of its lines at a time are copied together first.
 """
 

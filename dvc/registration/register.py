@@ -269,7 +269,8 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
         raise InputError("Strain discontinuities at tissue interfaces need a label map: labels (--labels).")
     if settings.engine.needs_bone and settings.align_on != "bone":
         raise InputError(
-            "Discontinuities at the bone need an alignment on the bone: align bone (--align bone), or no borders."
+            "GaussNewtonAtBone (--borders) needs images aligned on the bone: align bone (--align bone). Otherwise use "
+            "the engine GaussNewton (--no-borders)."
         )
     for name, given in (("tissue mask", body), ("bone mask", bone), ("label map", labels)):
         if given is None:

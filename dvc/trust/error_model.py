@@ -91,8 +91,8 @@ class ErrorTable:
         if self.far(spacing_mm, snr) <= _BEYOND:
             return ""
         return (
-            f"The error bars are those of voxels of {_told(self.spacing_mm)} mm at SNR {self.snr:.0f}; these images "
-            f"have {_told(spacing_mm)} mm and SNR {snr:.0f}, so the error bars are less certain."
+            f"The error bars were measured on phantoms (voxels of {_told(self.spacing_mm)} mm, SNR {self.snr:.0f}); "
+            f"these images have {_told(spacing_mm)} mm and SNR {snr:.0f}, so they may cover more or less than 95 %."
         )
 
     def expected(

@@ -120,7 +120,7 @@ class Grouped(TyperCommand):
             if not one or _EMPTY.fullmatch(one):  # the current folder, otherwise, whose files results may replace
                 of = one.removesuffix("=") or before
                 what = f"The value of {of}" if of.startswith("-") else "An argument"
-                ctx.fail(f"{what} is empty. If it is a variable of the shell, it is not set.")
+                ctx.fail(f"{what} is empty. If you gave a shell variable, it may not be set.")
         try:
             return super().parse_args(ctx, args)
         except Exception as missing:

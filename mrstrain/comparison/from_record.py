@@ -87,8 +87,8 @@ def fill_engine(given: _E, record: MeasuredWith, *, labelled: bool) -> _E:
         borders = how.get("borders")
         if labelled and "bone_alone" in (borders or {}):
             raise InputError(
-                f"{record.path}: the bone's surface was the only tissue interface of this measurement. Leave the label "
-                "map out (labels), so that the model is measured in the same way."
+                f"{record.path}: in this measurement, strain could be discontinuous only at the surface of the bone. "
+                "Leave out the label map (labels), so that the model is measured in the same way."
             )
         if labelled != (borders is not None):  # not what it is by default
             return given.model_copy(update={"borders": borders is not None})

@@ -46,8 +46,8 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
             return GaussNewtonWithInterfaces(smooth)
         if borders and how.align != "bone":
             raise InputError(
-                "`borders` needs a label map (labels), or an alignment on the bone (align = bone), at whose surface "
-                "strain may then be discontinuous."
+                "`borders` needs a label map: labels (--labels), or images aligned on the bone: align bone (--align "
+                "bone). Otherwise leave it out."
             )
         return GaussNewtonAtBone(smooth) if borders else smooth
     if bending is not None or volume is not None:

@@ -141,9 +141,9 @@ def earlier_results(out: Path, case_folders: Sequence[str]) -> str:
     """A sentence on what an earlier run left in an output folder, replaced or not; empty without results."""
     found = sorted({path.parent.name for path in out.glob(f"*/{QUALITY}")})
     replaced, kept = ([name for name in found if (name in case_folders) == these] for these in (True, False))
-    told = [f"results of an earlier run are replaced: {few(replaced)}"] if replaced else []
-    told += [f"results of an earlier run stay: {few(kept)}"] if kept else []
-    return f"{out}: {'; '.join(told)}." if told else ""
+    told = [f"Replaced: {few(replaced)}."] if replaced else []
+    told += [f"Kept, not part of this run: {few(kept)}."] if kept else []
+    return f"{out} holds results of an earlier run. {' '.join(told)}" if told else ""
 
 
 def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") -> None:

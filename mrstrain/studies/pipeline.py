@@ -204,7 +204,9 @@ class Pipeline:
                 continue
             unchanged = self.ledger.are_unchanged(stage, self._keys[stage.name][1])
             reason = (
-                self._outdated_inputs(stage) if unchanged else "An input changed while the study ran; run it again."
+                self._outdated_inputs(stage)
+                if unchanged
+                else "An input file of this stage changed while the study ran; run it again."
             )
             if reason:
                 self.outcomes[stage.name] = replace(outcome, reason=reason)

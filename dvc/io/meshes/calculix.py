@@ -126,7 +126,7 @@ def _add_elements(
     if alike:
         _log.warning(
             "%s: %d elements may be shells or beams that CalculiX expanded to solids, and count as tissue. To have "
-            "them recognised, put the input deck with them (%s) next to the result, or write it with OUTPUT=2D.",
+            "them recognised, put the input deck (%s) next to the result, or write the result with OUTPUT=2D.",
             mesh.path, alike, mesh.path.with_suffix(".inp").name,
         )  # fmt: skip
 

@@ -66,7 +66,7 @@ def test_an_empty_value_is_refused(given: list[str], told: str) -> None:
     """It was taken for the current folder, in which results replaced folders of their names."""
     ran = CliRunner().invoke(app, ["register", *given])
     assert ran.exit_code == 2
-    assert f"{told} If it is a variable of the shell, it is not set." in ran.output
+    assert f"{told} If you gave a shell variable, it may not be set." in ran.output
 
 
 @pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"doctor"}))  # which takes nothing

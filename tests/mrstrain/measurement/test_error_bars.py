@@ -151,8 +151,8 @@ def test_images_that_are_far_from_those_of_the_error_model_are_told_of_with_the_
     if far:
         own, snr_found = f"{0.8 * voxel:.2g}", round(min(one.snr for one in found.noise))
         assert bars.beyond == (
-            f"The error bars are those of voxels of {own} mm at SNR {snr:.0f}; these images have 0.8 mm and SNR "
-            f"{snr_found}, so the error bars are less certain."
+            f"The error bars were measured on phantoms (voxels of {own} mm, SNR {snr:.0f}); these images have 0.8 mm "
+            f"and SNR {snr_found}, so they may cover more or less than 95 %."
         )
 
 

@@ -353,7 +353,7 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         GaussNewtonWithInterfaces(skin=0.0)
     with pytest.raises(ParameterError, match="borders is only for the engine gauss-newton"):
         engine_of(RegistrationOptions(preset="heel-mr", borders=True))
-    with pytest.raises(InputError, match=r"need an alignment on the bone: align bone \(--align bone\)"):
+    with pytest.raises(InputError, match=r"needs images aligned on the bone: align bone \(--align bone\)"):
         register(**{**layers, "settings": Settings(GaussNewtonAtBone(), align_on="image")})
     for wrong, kind, said in (
         ({"align": "image"}, InputError, "needs a label map"),

@@ -128,10 +128,10 @@ def test_results_of_an_earlier_run_are_not_replaced_in_silence(spy, scans, tmp_p
         (tmp_path / name).mkdir()
         (tmp_path / name / "quality.json").write_text("{}")
     assert registered() == [
-        f"{tmp_path}: results of an earlier run are replaced: Load1; results of an earlier run stay: Old."
+        f"{tmp_path} holds results of an earlier run. Replaced: Load1. Kept, not part of this run: Old."
     ]
     shutil.rmtree(tmp_path / "Load1")
-    assert registered() == [f"{tmp_path}: results of an earlier run stay: Old."]
+    assert registered() == [f"{tmp_path} holds results of an earlier run. Kept, not part of this run: Old."]
 
 
 def test_where_no_load_is_registered_no_folder_is_left(spy, scans, tmp_path):

@@ -131,7 +131,7 @@ def test_an_input_that_changes_under_a_run_is_named(folder, monkeypatch, gone):
         _, outcomes, told = ran(folder)
     status = {name: outcome.status for name, outcome in outcomes.items()}
     assert status == dict.fromkeys(ALL, "done") | {"register a": "OUT OF DATE", "compare": "OUT OF DATE"}
-    assert "register a: OUT OF DATE. An input changed while the study ran; run it again." in told
+    assert "register a: OUT OF DATE. An input file of this stage changed while the study ran; run it again." in told
     assert "compare: OUT OF DATE. It depends on results that are out of date: register a." in told
     (folder / "a.txt").write_text("z")
     again, outcomes, _ = ran(folder)
