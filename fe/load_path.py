@@ -29,8 +29,9 @@ _FIRST_MM, _MOST_MM, _LEAST_MM = (0.25, 1.0), (1.0, 3.0), (0.01, 0.25)
 _MOST_OTHERWISE_MM = 0.6  # under displacement control, and with a plate that rotates: 1.0 is less exact (decision 7)
 _CLOSE_MM = 0.01
 # With a material whose stiffness is far from every published one, or whose stress falls, and below this fraction of the
-# normal load: least steps, of a stage and mm. Where they fail, smaller ones and viscous descent took minutes to fail.
-_EARLY, _LEAST_DOUBTED, _LEAST_DOUBTED_MM = 0.5, 1.0 / 32.0, 0.1
+# normal load: least steps, of a stage and mm, and how many may be left to the load once a step has failed. Smaller and
+# more steps, and viscous descent, took minutes to fail.
+_EARLY, _LEAST_DOUBTED, _LEAST_DOUBTED_MM, _MOST_DOUBTED = 0.5, 1.0 / 32.0, 0.1, 50
 # Fraction of a force up to which the plate is displacement controlled, so that nodes touch it in order. A plate that
 # rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
 _ENOUGH, _RELEASED = 0.8, (0.2, 0.4, 0.6, 0.8)
@@ -212,9 +213,10 @@ class LoadPath:
                 continue
             self._back(last)
             largest = _SHRINK * step
-            early = self._hopeless(self.plate.force_n[0], target.values[0])
-            if not converged and early and largest < _LEAST_DOUBTED_MM:
-                break
+            if not converged and self._hopeless(self.plate.force_n[0], target.values[0]):
+                left = self._to_force(axis, _AIM * aim_n) / largest
+                if largest < _LEAST_DOUBTED_MM or _MOST_DOUBTED < left < np.inf:
+                    break
 
     def _moved(self, axis: int, ahead: float) -> float:
         """Displacement of the plate along an axis, or against it, since it touched the tissue, mm."""
