@@ -5,13 +5,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label, maximum
-from skimage.segmentation import watershed
+from scipy.ndimage import distance_transform_edt
 
 from dvc.arguments import checked
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
+from dvc.images.bone_rim import bones_to_rims, reach_of
 from dvc.images.depth import depth_mm
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
@@ -21,14 +21,6 @@ from dvc.labelling.skin import Skin
 from dvc.labelling.tissues import TissueLabels
 from dvc.measurement.subject import is_bones_name
 
-_REACH = 2.5  # voxels, of a border that is moved
-_BLUR_MM = 0.4
-_AROUND_MM = 3.0  # standard deviation of the neighbourhood whose brightness is compared with that of a rim
-_DARK_PERCENT = 5.0  # of the voxels near a border of bone: as dark as its rim
-_EDGE = 0.4  # of the step from rim to soft tissue: the rim's darkest voxels still show some of what is beside it
-_RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are smaller
-_ONE_VOXEL = 1.05
-_LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no border
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +95,7 @@ def correct_labels(
         raise InputError("The probability of each tissue (probability) can be corrected by marks only: give both.")
     bones, skin = correctable(labels)
     watch(0.1)
-    even, body, reach = fill_missing(without_bias_field(image)), given > 0, _REACH * float(spacing.mean())
+    even, body, reach = fill_missing(without_bias_field(image)), given > 0, reach_of(spacing)
     watch(0.2)
     notes, ends = list[str](), _without_labels(image, body, spacing, reach)
     whole, fixed = body | ends, within(ends, spacing, reach)
@@ -122,7 +114,7 @@ def correct_labels(
     new_bones = bones
     if bones.any():
         tissues = [given == number for number in np.unique(given[body & ~bones])]
-        found_bones = _bones(even.values, bones, whole & ~new_skin, tissues, spacing, reach)
+        found_bones = bones_to_rims(even.values, bones, whole & ~new_skin, tissues, spacing)
         new_bones = np.where(fixed, bones, found_bones) & body
     new_skin &= ~new_bones
     watch(0.9)
@@ -174,47 +166,6 @@ def _without_labels(image: Image, body: BoolArray, spacing_mm: FloatArray, reach
         return unlabelled
     deep = distance_transform_edt(unlabelled, sampling=spacing_mm) > reach_mm
     return within(deep, spacing_mm, 1.5 * reach_mm) & unlabelled
-
-
-def _bones(
-    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray,
-    reach_mm: float,
-) -> BoolArray:  # fmt: skip
-    """Bones (ni, nj, nk) whose boundaries lie within reach of those given, at the outer edge of their dark rims.
-
-    From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim. The
-    bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Boundaries stay beside tissues as
-    dark as a rim, such as tendon.
-    """
-    inside, outside = (distance_transform_edt(of, sampling=spacing_mm) for of in (given, ~given))
-    parts, count = label(given)
-    deepest = np.concatenate([[0.0], np.atleast_1d(maximum(inside, parts, np.arange(1, count + 1)))])
-    core = given & (inside > np.minimum(reach_mm, 0.5 * deepest)[parts])
-    blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
-    seeds = np.where(core, 1, np.where((outside > reach_mm) | ~(soft | given), 2, 0))
-    inner = watershed(-blurred, seeds) == 1
-    near = (inside <= reach_mm) & (outside <= reach_mm) & (soft | given)
-    beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
-    dark = float(np.percentile(blurred[near], _DARK_PERCENT))
-    rim = near & (blurred < dark + _EDGE * (beside - dark))
-    thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
-    rim &= distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm
-    found = (inner | rim) & (soft | given)
-    joined, _ = label(found)
-    found = np.isin(joined, np.unique(joined[core])) & found
-    found |= binary_fill_holes(found)
-    seen = near & (beside > _LEAST_STEP * dark)
-    for tissue in tissues:
-        if float(np.median(blurred[tissue])) < _LEAST_STEP * dark:
-            seen &= distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_mm
-    return np.where(seen, found, given)
-
-
-def _mean_around(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -> FloatArray:
-    """Mean of the values (ni, nj, nk) of some voxels in the neighbourhood of each voxel; 0 if there are none."""
-    sigma = _AROUND_MM / spacing_mm
-    share = gaussian_filter(where.astype(np.float32), sigma)
-    return np.asarray(gaussian_filter(np.where(where, values, 0.0), sigma) / np.maximum(share, 1e-4))
 
 
 def _nearest(labels: IntArray, where: BoolArray) -> IntArray:

@@ -23,6 +23,7 @@ from dvc.deformation.interface_spline import NUMBERS, Interfaces, InterfaceSplin
 from dvc.deformation.protocol import Deformation
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
+from dvc.images.bone_rim import NUMBERS as OF_RIM, bone_to_rim
 from dvc.images.image import Grid, LabelMap, Mask
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
@@ -45,7 +46,9 @@ STAGE = {
     "steps": _STEPS, "of_jumps": [_BENDING, _SQUARE], "distances": NUMBERS,
 }  # fmt: skip
 """Every number that decides the result of this stage, for a record."""
-STAGE_AT_BONE = {name: STAGE[name] for name in ("steps", "of_jumps", "distances")} | {"laplacians": _WITH_JUMPS}
+STAGE_AT_BONE = {
+    "steps": _STEPS, "of_jumps": STAGE["of_jumps"], "distances": NUMBERS, "laplacians": _WITH_JUMPS, "rim": OF_RIM,
+}  # fmt: skip
 """The same where the bone is the only tissue that is known."""
 
 
@@ -55,7 +58,8 @@ def fit_with_interfaces(
 ) -> tuple[InterfaceSpline, Choice]:  # fmt: skip
     """Find the displacement, LPS mm, that carries the fixed image to the moving one, its gradient free at interfaces.
 
-    The pair needs labels; without them, the surface of the bone is the only interface. A tissue named "skin" may resist
+    The pair needs labels; without them, the surface of the bone is the only interface, and it is moved to the outer edge
+    of the bone's dark rim, since an interface off by a voxel is worse than none. A tissue named "skin" may resist
     strain, and the bone, if there is one, does not move. The weight k of strain in the skin, 1/mm3, is chosen by
     cross-validation where it is not given; it becomes the choice's weight "rigidity", zero without skin. The rest is as
     in `dvc.registration.gauss_newton.fit.fit`.
@@ -98,8 +102,9 @@ class _Stage:
     """The last stage at full resolution: in the whole body, and in a slab of it in which weights are chosen."""
 
     def __init__(self, pair: AlignedPair, control: Grid, rest: FloatArray | None) -> None:
-        labels, inside = pair.labels or _bone_alone(pair), pair.compared.inside
-        self.interfaces = Interfaces.of(labels, pair.bone, float(control.spacing_mm.mean()), pair.body)
+        bone, inside = pair.bone if pair.labels else _at_its_rim(pair), pair.compared.inside
+        labels = pair.labels or LabelMap(pair.fixed.grid, np.ones(inside.shape, dtype=int), {1: "tissue"})
+        self.interfaces = Interfaces.of(labels, bone, float(control.spacing_mm.mean()), pair.body)
         soft = pair.body.inside & (self.interfaces.own != self.interfaces.rest)
         named = [number for number, name in labels.names.items() if name.lower() == _SKIN]
         skin = soft & np.isin(labels.labels, named)
@@ -118,11 +123,11 @@ class _Stage:
         self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & slab).any())
 
 
-def _bone_alone(pair: AlignedPair) -> LabelMap:
-    """The bone in a tissue that is everywhere else; InputError without a bone."""
+def _at_its_rim(pair: AlignedPair) -> Mask:
+    """The bone as the image shows it; InputError without a bone."""
     if pair.bone is None:
         raise InputError("Strain discontinuities need a label map (labels), or an alignment on a bone mask.")
-    return LabelMap(pair.bone.grid, np.where(pair.bone.inside, 2, 1), {1: "tissue", 2: "bone"})
+    return bone_to_rim(pair.fixed, pair.bone, pair.body)
 
 
 def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:

@@ -1,0 +1,88 @@
+"""The surface of a bone as an MR image shows it: the outer edge of its dark rim."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label, maximum
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.images.image import Image, Mask
+from dvc.images.resample import fill_missing
+
+_REACH = 2.5  # voxels, of a surface that is moved
+_BLUR_MM = 0.4
+_AROUND_MM = 3.0  # standard deviation of the neighbourhood whose brightness is compared with that of a rim
+_TRUNCATE = 4.0  # standard deviations at which a Gaussian ends
+_DARK_PERCENT = 5.0  # of the voxels near a surface of bone: as dark as its rim
+_EDGE = 0.4  # of the step from rim to soft tissue: the rim's darkest voxels still show some of what is beside it
+_RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are smaller
+_ONE_VOXEL = 1.05
+_LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no surface
+NUMBERS = {
+    "reach": _REACH, "blur_mm": _BLUR_MM, "around_mm": _AROUND_MM, "dark_percent": _DARK_PERCENT, "edge": _EDGE,
+    "rim_mm": _RIM_MM, "one_voxel": _ONE_VOXEL, "least_step": _LEAST_STEP,
+}  # fmt: skip
+"""Every number that determines where a surface is moved to, for a record."""
+
+
+def reach_of(spacing_mm: FloatArray) -> float:
+    """How far a surface is moved at most, mm: 2.5 times the mean voxel edge."""
+    return _REACH * float(spacing_mm.mean())
+
+
+def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
+    """The bone of a mask, with its surface at the outer edge of its dark rim; see `bones_to_rims`.
+
+    ``image`` has no bias field; the bone and the ``body``, bone included, are on its grid.
+    """
+    spacing = image.grid.spacing_mm
+    box = bone.box(int(np.ceil((reach_of(spacing) + _TRUNCATE * _AROUND_MM) / spacing.min())))
+    part = fill_missing(Image(image.grid.part(box), image.values[box]))
+    given, found = bone.inside[box], bone.inside.copy()
+    found[box] = bones_to_rims(part.values, given, body.inside[box] & ~given, (), spacing)
+    return Mask(bone.grid, found)
+
+
+def bones_to_rims(
+    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray
+) -> BoolArray:
+    """Bones (ni, nj, nk) whose surfaces lie within reach of those given, at the outer edge of their dark rims.
+
+    From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim. The
+    bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Where the image shows no such edge,
+    and beside those of the ``tissues`` that are as dark as a rim, such as tendon, surfaces stay. ``values`` are those of
+    an image without its bias field and without missing voxels.
+    """
+    from skimage.segmentation import watershed  # takes longer to import than most registrations have time for
+
+    reach_mm = reach_of(spacing_mm)
+    inside, outside = (distance_transform_edt(of, sampling=spacing_mm) for of in (given, ~given))
+    parts, count = label(given)
+    deepest = np.concatenate([[0.0], np.atleast_1d(maximum(inside, parts, np.arange(1, count + 1)))])
+    core = given & (inside > np.minimum(reach_mm, 0.5 * deepest)[parts])
+    blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
+    seeds = np.where(core, 1, np.where((outside > reach_mm) | ~(soft | given), 2, 0))
+    inner = watershed(-blurred, seeds) == 1
+    near = (inside <= reach_mm) & (outside <= reach_mm) & (soft | given)
+    beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
+    dark = float(np.percentile(blurred[near], _DARK_PERCENT))
+    rim = near & (blurred < dark + _EDGE * (beside - dark))
+    thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
+    rim &= distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm
+    found = (inner | rim) & (soft | given)
+    joined, _ = label(found)
+    found = np.isin(joined, np.unique(joined[core])) & found
+    found |= binary_fill_holes(found)
+    seen = near & (beside > _LEAST_STEP * dark)
+    for tissue in tissues:
+        if float(np.median(blurred[tissue])) < _LEAST_STEP * dark:
+            seen &= distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_mm
+    return np.where(seen, found, given)
+
+
+def _mean_around(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -> FloatArray:
+    """Mean of the values (ni, nj, nk) of some voxels in the neighbourhood of each voxel; 0 if there are none."""
+    sigma = _AROUND_MM / spacing_mm
+    share = gaussian_filter(where.astype(np.float32), sigma, truncate=_TRUNCATE)
+    total = gaussian_filter(np.where(where, values, 0.0), sigma, truncate=_TRUNCATE)
+    return np.asarray(total / np.maximum(share, 1e-4))
