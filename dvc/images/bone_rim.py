@@ -50,8 +50,8 @@ def bones_to_rims(
 
     From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim. The
     bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Where the image shows no such edge,
-    and beside those of the ``tissues`` that are as dark as a rim, such as tendon, surfaces stay. ``values`` are those of
-    an image without its bias field and without missing voxels.
+    and beside those of the ``tissues`` that are as dark as a rim, such as tendon, surfaces stay. ``values`` are of an
+    image without its bias field and without missing voxels.
     """
     from skimage.segmentation import watershed  # takes longer to import than most registrations have time for
 

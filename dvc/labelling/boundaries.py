@@ -1,6 +1,6 @@
 """A label map that was drawn or made before, corrected: by the image, or near a few marks."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -20,7 +20,6 @@ from dvc.labelling.near_marks import certain, corrected_near
 from dvc.labelling.skin import Skin
 from dvc.labelling.tissues import TissueLabels
 from dvc.measurement.subject import is_bones_name
-
 
 
 @dataclass(frozen=True, slots=True, eq=False)
