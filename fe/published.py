@@ -102,7 +102,7 @@ class MaterialSet:
             raise InputError(
                 f"The material set {self.name} has no material for the region '{region}'{instead}; it has "
                 f"{few(self.materials, most=3)}. Write your own set (.toml) with it, rename the region, or, "
-                "if it is a bone, name it so when meshing."
+                "if it is a bone, mesh with it among the bones (`bones`; --bone; in a study file: [mesh] bones)."
             )
         return name
 

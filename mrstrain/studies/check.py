@@ -11,7 +11,6 @@ import numpy as np
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
 from dvc.errors import MrstrainError
 from dvc.io.images.labels import read_names
-from dvc.io.images.scan_parameters import read_scan_parameters
 from dvc.io.result_folder import REPEAT
 from dvc.labelling.boundaries import correctable
 from dvc.labelling.tissues import NAMES
@@ -30,11 +29,10 @@ from fe import (
 )
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
-from mrstrain.options.acquisition import AcquisitionOptions
-from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.options.measurement import in_parallel
 from mrstrain.options.modelling import ModelReading
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
+from mrstrain.studies.credibility import details_not_given
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
@@ -95,7 +93,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         looked.tried(looked.at_results, labels)
     planned, next_step = looked.tried(plan, told), ""
     if planned is not None and not looked.wrong:  # else only what is wrong counts
-        looked.at_report_details()
+        looked.notes += details_not_given(told)
         assumed = told.plate.assumed("change normal in [plate] of the study file")
         if assumed and told.models.sets and not all(load.plate_normal for load in told.loads.values()):
             looked.notes.append(assumed)
@@ -282,16 +280,21 @@ class _Look:
             self.tried(check_meshing, labels, how.edge_mm, bones, how.finer)
         else:
             self.wrong.append(f"{self.study.at('mesh', 'bones')}: {labels.no_region(BONE)}")
+        self.soft(labels, warned=True)
+
+    def soft(self, labels: LabelMap | None, warned: bool = False) -> list[str]:
+        """Names of the tissues that are meshed, of a label map or (None) of one made from the image."""
+        names, bones = list(NAMES.values()), self.study.mesh.bones or tuple(filter(is_bones_name, NAMES.values()))
+        if labels is not None:
+            there, bones = np.unique(labels.labels), bones_of(labels, self.study.mesh.bones)
+            names = [name for n, name in labels.names.items() if n != 0 and n in there]
+        soft = [name for name in names if name not in bones]
         self.warnings += [
             f"{name} will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] bones."
-            for name in self.soft(labels)
-            if is_bones_name(name)
+            for name in soft
+            if warned and is_bones_name(name)
         ]
-
-    def soft(self, labels: LabelMap) -> list[str]:
-        """Names of the tissues that are meshed."""
-        there, bones = np.unique(labels.labels), bones_of(labels, self.study.mesh.bones)
-        return [name for n, name in labels.names.items() if n != 0 and n in there and name not in bones]
+        return soft
 
     def at_simulations(self, reference: Image | None, labels: LabelMap | None) -> None:
         """Report problems for `simulate`, on a mesh made elsewhere or from these labels."""
@@ -363,7 +366,9 @@ class _Look:
                     f"{self.study.path(self.study.mesh.labels)}: only {100 * there:.0f} % of the labelled tissue lies "
                     "in the unloaded image. The label map to be meshed must be in the coordinates of the images."
                 )
-        soft = [name for name in NAMES.values() if not is_bones_name(name)] if labels is None else self.soft(labels)
+        soft = self.soft(labels, warned=labels is None)
+        if labels is None:  # other bones may not be there
+            soft = [name for name in soft if not is_bones_name(name)]
         for one in sets:
             self.laws_of(one, soft)
         for region in self.study.uncertainty.stiffness:
@@ -374,19 +379,6 @@ class _Look:
             self.wrong.append(
                 "[models] fixed: 'cut' (the truncation surface) can only be detected if a tissue of the label map is "
                 "named skin."
-            )
-
-    def at_report_details(self) -> None:
-        """Note how many keys of [acquisition] and [credibility] are not given; none is required."""
-        place = self.study.path(self.study.images.load0)
-        told = read_scan_parameters(place).known() | self.study.acquisition.model_dump(exclude_none=True)
-        keys = {"acquisition": AcquisitionOptions.model_fields, "credibility": CredibilityOptions.model_fields}
-        told |= self.study.credibility.model_dump(exclude_none=True)
-        lacking = {table: sum(name not in told for name in names) for table, names in keys.items()}
-        if counts := [f"{count} of {len(keys[table])} in [{table}]" for table, count in lacking.items() if count]:
-            self.notes.append(
-                f"Optional details of the report that are not given: {', '.join(counts)}. A study file written by "
-                "`mrstrain init` lists the keys."
             )
 
     def at_results(self, labels: LabelMap) -> None:

@@ -6,9 +6,12 @@ from typing import Any
 
 from dvc import Verdict
 from dvc.errors import InputError
+from dvc.io.images.scan_parameters import read_scan_parameters
 from dvc.report.page import Section
 from mrstrain.comparison.credibility import Holdings, credibility_section
 from mrstrain.comparison.model_facts import facts_of
+from mrstrain.options.acquisition import AcquisitionOptions
+from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.records.provenance import file_hash, read_record
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome
@@ -32,6 +35,19 @@ def study_credibility(study: Study, outcomes: Mapping[str, StageOutcome]) -> lis
         study.study.name, study.credibility,
     )  # fmt: skip
     return [credibility_section(held)]
+
+
+def details_not_given(study: Study) -> list[str]:
+    """A sentence on how many keys of [acquisition] and [credibility] are not given, none of which is required."""
+    of_scan = read_scan_parameters(study.path(study.images.load0)).known()
+    told = of_scan | study.acquisition.model_dump(exclude_none=True) | study.credibility.model_dump(exclude_none=True)
+    keys = {"acquisition": AcquisitionOptions.model_fields, "credibility": CredibilityOptions.model_fields}
+    lacking = {table: sum(name not in told for name in names) for table, names in keys.items()}
+    counts = [f"{count} of {len(keys[table])} in [{table}]" for table, count in lacking.items() if count]
+    if not counts:
+        return []
+    by_init = "A study file written by `mrstrain init` lists the keys."
+    return [f"Optional details of the report that are not given: {', '.join(counts)}. {by_init}"]
 
 
 def _verdicts(study: Study, outcomes: Mapping[str, StageOutcome]) -> dict[str, Verdict | None]:

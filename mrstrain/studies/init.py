@@ -29,7 +29,7 @@ _LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
 _ONE_BONE = re.compile(r"(.*[ _-])?(calcaneus|calcaneum|bone)[ _-]*seg(mentation)?", re.IGNORECASE)
 _SEVERAL = re.compile(r"label|tissue|fat|muscle|skin|to[ _-]?mesh", re.IGNORECASE)
 _TO_MESH = re.compile(r"to[ _-]?mesh", re.IGNORECASE)
-_BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
+_BONE = re.compile(r"calcaneus|calcaneum|bone|(?<![a-z])calc(?![a-z])", re.IGNORECASE)
 _VARIANT = "-as-published"  # suffix of sets with another interpretation of the published parameters
 _SOFTEST = "friedman"  # takes hours, so it must be named explicitly
 _ROLES = {
@@ -137,7 +137,7 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
     Raises
     ------
     InputError
-        If the folder does not exist, or two files seem to be the unloaded image.
+        If the folder does not exist or holds slices itself, or two files seem to be the unloaded image.
     OutputError
         If the folder already has a study file.
     """
@@ -148,6 +148,11 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
     if target.exists():
         raise OutputError(f"{target} already exists; remove it to write a new one.")
     found = _look(place)
+    if found == StudyInputs() and _holds_dicom(place):
+        raise InputError(
+            f"{place} holds the slices of a DICOM series. Move each series to a folder of its own, such as "
+            f"{place / 'Load0'} and {place / 'Load1'}."
+        )
     picture, names = _drawn(place, found)
     answers = Answers() if ask is None else ask(found, names, picture)
     found.unused.pop(answers.bone_mask or "", None)

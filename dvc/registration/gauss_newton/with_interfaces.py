@@ -60,9 +60,9 @@ def fit_with_interfaces(
 
     The pair needs labels; without them, the surface of the bone is the only interface. It is then moved to the outer
     edge of the bone's dark rim, because an interface that is off by a voxel is worse than none. A tissue named "skin"
-    may resist strain, and the bone, if there is one, does not move. The weight k of strain in the skin, 1/mm3, is chosen
-    by cross-validation where it is not given; it becomes the choice's weight "rigidity", zero without skin. The rest is
-    as in `dvc.registration.gauss_newton.fit.fit`.
+    may resist strain, and the bone, if there is one, does not move. The weight k of strain in the skin, 1/mm3, is
+    chosen by cross-validation where it is not given; it becomes the choice's weight "rigidity", zero without skin. The
+    rest is as in `dvc.registration.gauss_newton.fit.fit`.
     """
     usual = replace(parameters, bending=parameters.weights.bending)
     smooth, first = fit(pair, usual, start, lambda share: progress(_SMOOTH_SHARE * share))

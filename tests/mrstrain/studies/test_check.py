@@ -152,6 +152,10 @@ def test_labels_that_are_made_later_are_checked_by_what_they_are_made_from(study
     assert "no material for the region 'skin'" in wrong(study, named)  # mine.toml has a law for fat alone
     assert wrong(study, named, ('"mine.toml", ', "")) == ""
     assert "Labels: made from the image" in check(study).notes
+    assert "other bone" not in " ".join(check(study).warnings)
+    bones = ("[mesh]", '[mesh]\nbones = ["bone"]')
+    assert wrong(study, named, ('"mine.toml", ', ""), bones) == ""  # the image may show no other bone
+    assert any(warning.startswith("other bone will be meshed as soft tissue") for warning in check(study).warnings)
     elsewhere = LabelMap(replace(GRID, origin_mm=GRID.origin_mm + 500.0), values, {1: "calcaneus", 2: "fat"})
     write_labels(study / "strokes.nii.gz", elsewhere)
     assert "strokes.nii.gz" in wrong(study, named, ('"mine.toml", ', ""))
