@@ -48,6 +48,7 @@ from mrstrain.records.inputs import (
     read_subject,
     refuse_small_disk,
     refuse_touching_inputs,
+    swapped_by_name,
 )
 from mrstrain.records.outcome import with_reasons
 from mrstrain.records.progress import NOTE, OnProgress, expect
@@ -94,6 +95,8 @@ def register(
     given = [p for of in (subject_files, strokes, registration, scans, onto) for p in of.paths]
     refuse_touching_inputs(target, cases, [load0, *paths, *given])
     align, tell = registration.align, progress or (lambda *_: None)
+    if swapped := swapped_by_name(load0, [Path(p) for p in loads]):
+        tell(NOTE, swapped, 0.0)
     if subject_files.labels == AUTO:
         check_auto(subject_files, strokes, cases, scans)
     elif strokes.paths:

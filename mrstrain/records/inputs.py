@@ -1,5 +1,6 @@
 """What a command was given, read and checked before anything is computed."""
 
+import re
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
@@ -24,6 +25,7 @@ from mrstrain.records.log import begin_logs
 from mrstrain.records.provenance import file_hash
 
 _LOCK = ".mrstrain-lock"
+_UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 
 
@@ -106,6 +108,21 @@ def matrix_of(rows: object, where: str) -> FloatArray:
     if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-9):
         raise InputError(f"{where}: the last row of the matrix must be 0 0 0 1; it is {matrix[3].tolist()}.")
     return matrix
+
+
+def named_unloaded(name: str) -> bool:
+    """Whether an image is named like the unloaded one: Load0, heel_unloaded, baseline."""
+    return _UNLOADED.search(image_stem(name)) is not None
+
+
+def swapped_by_name(load0: Path, loads: Sequence[Path]) -> str:
+    """A sentence if a loaded image is named like the unloaded one, and the unloaded one is not; empty otherwise."""
+    if named_unloaded(load0.name) or not (odd := [path.name for path in loads if named_unloaded(path.name)]):
+        return ""
+    return (
+        f"{odd[0]} is given as a loaded image, but named like the unloaded one. If the images are swapped, strains are "
+        f"wrong: the unloaded image comes first, here {load0.name}."
+    )
 
 
 def image_stem(name: str) -> str:

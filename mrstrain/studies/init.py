@@ -17,10 +17,9 @@ from fe import BONE, published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.simulate import LOADS
 from mrstrain.options.modelling import Directions
-from mrstrain.records.inputs import IMAGE_ENDINGS, image_stem
+from mrstrain.records.inputs import IMAGE_ENDINGS, image_stem, named_unloaded
 from mrstrain.studies.file import FILE
 
-_UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
 _AGAIN = re.compile(r"again|repeat|rescan|retest", re.IGNORECASE)
 _LOADED = re.compile(
     r"load[ _-]?[1-9]\d*|loaded|(?<![a-z\d.])[1-9]\d+(\.\d+)?n(?![a-z\d])", re.IGNORECASE
@@ -261,7 +260,7 @@ def _role(stem: str) -> str | None:
     if _BONE.search(stem):
         return "bone_mask"
     again = _AGAIN.search(stem) is not None
-    if _UNLOADED.search(stem):
+    if named_unloaded(stem):
         return "repeat" if again else "load0"
     if _LOADED.search(stem) and not again:
         return "load"

@@ -21,6 +21,7 @@ from mrstrain.records.inputs import (
     read_subject,
     refuse_small_disk,
     refuse_touching_inputs,
+    swapped_by_name,
 )
 from mrstrain.studies.run import run_studies
 
@@ -98,3 +99,24 @@ def test_a_damaged_matrix_is_refused_and_warns_of_nothing(tmp_path: Path, text: 
     (tmp_path / "m.txt").write_text(text)
     with pytest.raises(InputError, match=rf"m\.txt: .*{message}"):
         read_matrix(tmp_path / "m.txt")
+
+
+@pytest.mark.parametrize(
+    ("load0", "loads", "odd"),
+    [
+        ("heel_140N.nii.gz", ["heel_unloaded.nii.gz"], "heel_unloaded.nii.gz"),
+        ("Load1.nii.gz", ["Load2.nii.gz", "load_0.nrrd"], "load_0.nrrd"),
+        ("Load0.nii.gz", ["Load1.nii.gz", "Load0-again.nii.gz"], ""),
+        ("a.nii.gz", ["b.nii.gz"], ""),
+    ],
+)
+def test_images_that_their_names_say_are_swapped_are_told(load0: str, loads: list[str], odd: str, tmp_path) -> None:
+    told = swapped_by_name(Path(load0), [Path(load) for load in loads])
+    assert told.startswith(f"{odd} is given as a loaded image, but named like the unloaded one") if odd else told == ""
+    notes = list[str]()
+    with pytest.raises(InputError):  # there are no such files
+        register(
+            tmp_path / load0, [tmp_path / load for load in loads], out=tmp_path / "out", align="image",
+            progress=lambda _, stage, __: notes.append(stage),
+        )  # fmt: skip
+    assert any("named like the unloaded one" in note for note in notes) == bool(odd)
