@@ -134,7 +134,7 @@ def map_fields(
     Parameters
     ----------
     mesh : TetMesh
-        Reference configuration, LPS mm. Its regions give the tissues if they have the names of labels.
+        Reference configuration, LPS mm. Its regions give the tissues if they have the names of labels, in any case.
     labels : LabelMap
         Of the unloaded image.
     bones : sequence of str
@@ -167,8 +167,12 @@ def map_fields(
 
 
 def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.ndarray:
-    """Tissue of each cell (m,) str: its region, if that is the name of a label; otherwise the label at its centroid."""
+    """Tissue of each cell (m,) str: its region, if that names a label; otherwise the label at its centroid.
+
+    Case does not matter where it does not distinguish labels: Abaqus writes names in capitals.
+    """
     names = set(labels.names.values())
+    in_any_case = {name.casefold(): name for name in labels.names.values()}
     tissue = np.full(len(mesh.cells), UNNAMED, dtype=f"<U{max(len(n) for n in (*names, UNNAMED))}")
     nearest = np.rint(labels.grid.indices_of(mesh.centroids_mm)).astype(np.int64)
     inside = ((nearest >= 0) & (nearest < np.array(labels.grid.shape))).all(axis=1)
@@ -176,8 +180,9 @@ def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.n
     number[inside] = labels.labels[tuple(nearest[inside].T)]
     for value, name in labels.names.items():
         tissue[number == value] = name
-    for name, cells in mesh.regions.items():
-        if by_mesh and name in names:
+    for region, cells in mesh.regions.items():
+        name = region if region in names else in_any_case.get(region.casefold())
+        if by_mesh and name is not None:
             tissue[cells] = name
     return tissue
 

@@ -176,3 +176,23 @@ def test_a_model_whose_bone_moves_is_told_and_one_that_moves_far_is_not_trusted(
         assert "unit and frame of the displacements, and that they are in the order of the nodes" in odd[0].told
         several = [case(load, at_rest, models, error_table(0.0, 0.01)) for load in ("Load1", "Load2")]
         assert all(one.endswith(not_trusted) for one in compare(several, labels()).ranking.statements)
+
+
+@pytest.mark.parametrize("written_as", [str.lower, str.upper, str.title])
+def test_tissues_of_a_model_have_the_names_of_labels_in_any_case(written_as) -> None:
+    """Abaqus writes names in capitals; tissues that are exchanged are told all the same."""
+    mesh = cube()
+    fat, skin = mesh.regions["fat"], mesh.regions["skin"]
+    right, wrong = (
+        TetMesh(mesh.points_mm, mesh.cells, {written_as("fat"): a, written_as("skin"): b}, mesh.facets)
+        for a, b in ((fat, skin), (skin, fat))
+    )
+    assert map_fields(right, labels(), ["bone"], sheared(0.0), {}).tissues == ["fat", "skin"]
+    notes = {
+        name: [
+            told for told in misfits(result(name, one, sheared(0.1)), labels(), ["bone"]) if "same tissue" in str(told)
+        ]
+        for name, one in (("right", right), ("wrong", wrong))
+    }
+    assert not notes["right"]
+    assert "have the same tissue name in only 0 % of the volume" in str(notes["wrong"])

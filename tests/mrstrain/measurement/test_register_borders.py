@@ -10,6 +10,7 @@ import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from dvc.deformation.bspline import BSpline
@@ -112,18 +113,21 @@ def test_strain_is_found_up_to_bone_and_skin(pad, out, worker):
 
 
 def test_the_bone_mask_alone_lets_strain_jump_at_the_bone(pad, tmp_path):
-    """Without labels: .101 in fat within 3 mm of bone with one spline, .049 with the bone's surface as an interface."""
-    write_mask(bone := tmp_path / "bone.nii.gz", pad.labels.region("bone"))
-    images = pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"]
+    """Without labels .101 in fat within 3 mm of bone with one spline, .068 with an interface at the bone's dark rim.
+
+    The mask is a voxel too large: .122 with an interface where it ends.
+    """
+    bone, images = pad.labels.region("bone"), (pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"])
+    write_mask(mask := tmp_path / "bone.nii.gz", Mask(GRID, binary_dilation(bone.inside)))
     errors, shear = {}, {}
     for borders in (None, True):
         with tasks_run_here():
-            assert not run(*images, out=tmp_path / str(borders), bone=bone, borders=borders, threads=1).failures
+            assert not run(*images, out=tmp_path / str(borders), bone=mask, borders=borders, threads=1).failures
         shear[borders] = shear_of(tmp_path / str(borders) / "Load1")
         errors[borders] = pad.shear_error(shear[borders])
-    assert errors[True]["fat"] < 0.6 * errors[None]["fat"]
+    assert errors[True]["fat"] < 0.75 * errors[None]["fat"]
     assert errors[True]["skin"] < 1.1 * errors[None]["skin"]
-    assert np.nanmax(shear[True][pad.labels.region("bone").inside]) == 0.0
+    assert np.nanmax(shear[True][binary_erosion(bone.inside, iterations=2)]) == 0.0
     folder = tmp_path / "True" / "Load1"
     assert isinstance(spline_in(folder), InterfaceSpline)
     told = json.loads((folder / "quality.json").read_text())
