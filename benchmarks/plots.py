@@ -40,7 +40,7 @@ PEERS = {
     "gauss-newton": "mrstrain", "gauss-newton-borders": "mrstrain with a label map", "heel-mr": "mrstrain with elastix",
     "elastix default, as acquired": "elastix, defaults",
 }  # fmt: skip
-SETS = ("trebbi", "zwam", "erdemir", "luboz")
+SETS = ("trebbi", "zwam", "erdemir", "akrami", "luboz")
 MOTIONS = {
     "trebbi": "material set trebbi", "akrami": "material set akrami", "stiff-skin": "stiff skin",
     "soft-skin": "soft skin", "stiff-fat": "stiff fat", "stiff-muscle": "stiff muscle", "lobules": "fat in lobules",
