@@ -174,8 +174,8 @@ class EngineOptions(Options):
     """Registration engine: gauss-newton or elastix. Default: gauss-newton; with --preset or --parameters, elastix."""
     borders: Flag | None = None
     """gauss-newton: allow strain discontinuities at tissue interfaces. Default: on with --labels; disable it if label
-    boundaries are wrong by more than one voxel. Without --labels (default: off): only at the surface of the bone,
-    without error bars. A bone mask that is a voxel too large then makes the error larger."""
+    boundaries are wrong by more than one voxel. Without --labels (default: off): only at the surface of the bone, as
+    the image shows it near that of the mask, without error bars."""
     preset: str | None = None
     """Built-in elastix parameters: heel-mr."""
     parameters: tuple[Path, ...] = ()

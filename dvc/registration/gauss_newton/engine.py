@@ -30,8 +30,9 @@ _NOTE = (
     "no spline with discontinuities."
 )
 _NOTE_AT_BONE = (
-    "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid; the key results of the "
-    "bone are those of the preceding smooth spline. The whole motion, that of the bone included, is in transform.h5, "
+    "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid. This surface is placed at "
+    "the dark rim of the bone in the unloaded image, up to 2.5 voxels from that of the mask; the key results of the bone "
+    "are those of the preceding smooth spline. The whole motion, that of the bone included, is in transform.h5, "
     "as displacements at voxels. No elastix text files are written, because elastix has no spline with discontinuities."
 )
 
@@ -218,6 +219,8 @@ class GaussNewtonWithInterfaces(Engine):
 class GaussNewtonAtBone(Engine):
     """Strain may be discontinuous at the surface of the bone, which is rigid; no label map is needed.
 
+    The surface is that of the mask, moved to the outer edge of the bone's dark rim by up to 2.5 voxels.
+
     Attributes
     ----------
     smooth : GaussNewton
@@ -260,7 +263,8 @@ class GaussNewtonAtBone(Engine):
             return ""
         return (
             f"{smooth}; starting from this result, a second B-spline was added that vanishes on the surface of the "
-            "bone, so that strain can be discontinuous there, with a rigid bone"
+            "bone, so that strain can be discontinuous there, with a rigid bone, whose surface was placed at the outer "
+            "edge of its dark rim in the unloaded image"
         )
 
     def prepare(self) -> None:
