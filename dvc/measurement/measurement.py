@@ -289,7 +289,7 @@ class Measurement:
         point_mm : (3,), optional
             Point where the planes meet, LPS mm; by default the lowest point of the bone, or the middle of the tissue.
         largest : float, optional
-            Upper end of the colour scale, in the unit of the quantity.
+            Upper end of the colour scale, in the unit of the quantity; by default just above the 99th percentile.
 
         Raises
         ------
@@ -300,7 +300,7 @@ class Measurement:
         """
         view, values = self._view(point_mm), self._values_of(quantity)
         outline = None if self.source is None else self.source.subject.labels
-        scale = Scale.of(quantity, view.shown(values), largest)
+        scale = Scale.of(quantity, values if quantity == "max_shear" else view.shown(values), largest)
         return coloured(view, self.image, values, scale, planes=planes, outline=outline).finished()
 
     def _values_of(self, quantity: str) -> Float32Array:

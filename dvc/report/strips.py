@@ -39,16 +39,14 @@ class Strip:
     max_shear: Mapping[str, Float32Array]  # by model, and of `MEASURED`; NaN where undefined
 
 
-def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
+def strain_by_load(strips: Sequence[Strip], rows: Sequence[str], largest: float) -> Figure:
     """Maximum shear strain under each load, in one slice of the unloaded anatomy.
 
     Load0 is the unloaded image, or its label map if there is no image. A anterior, P posterior, S superior, I
     inferior, R right, L left. White lines are the surfaces of the body and of the bones. Grey: strain is not defined
-    (not measured, or outside the mesh of a model). All slices of this picture have one colour scale, which ends at the
-    98th percentile of all that is shown, rounded up to the next multiple of 0.05; pictures of single loads have scales
-    of their own.
+    (not measured, or outside the mesh of a model).
     """
-    # A row for each name; they are those of `Strip.max_shear`.
+    # A row for each name; they are those of `Strip.max_shear`. The colours end at ``largest``.
     first, many = strips[0], len(rows) > 1
     left, right, bottom, top = first.extent_mm
     width_mm, height_mm = right - left, abs(top - bottom)
@@ -57,7 +55,7 @@ def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     inches = min(((WIDTH_IN - aside_in) / columns - _GAP_IN) / width_mm, _TALLEST_IN / height_mm)
     w, h = inches * width_mm, inches * height_mm
     size = aside_in + columns * (w + _GAP_IN), _HEAD_IN + len(rows) * (h + _GAP_IN) + _FOOT_IN
-    figure, norm = empty(size), Normalize(0.0, _highest(strips, rows))
+    figure, norm = empty(size), Normalize(0.0, largest)
     middle = _FOOT_IN + (len(rows) - 1) * (h + _GAP_IN) / 2
     unloaded = slice_panel(figure, (0.0, middle / size[1], w / size[0], h / size[1]))
     _unloaded(unloaded, first, norm)
@@ -78,7 +76,7 @@ def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     return figure
 
 
-def narrow_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
+def narrow_by_load(strips: Sequence[Strip], rows: Sequence[str], largest: float) -> Figure:
     """The slices of `strain_by_load` in two columns, for a narrow screen; the unloaded image is small, and last."""
     first, many = strips[0], len(rows) > 1
     shown = [(strip, name) for strip in strips for name in rows]
@@ -90,7 +88,7 @@ def narrow_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     w, h = inches * width_mm, inches * height_mm
     foot_in = _HEAD_IN + max(_SMALL * h, _FOOT_IN)
     size = _NARROW_IN, lines * (h + _HEAD_IN) + foot_in
-    figure, norm = empty(size), Normalize(0.0, _highest(strips, rows))
+    figure, norm = empty(size), Normalize(0.0, largest)
     for number, (strip, name) in enumerate(shown):
         line, column = divmod(number, columns)
         low = size[1] - (line + 1) * (h + _HEAD_IN)
@@ -110,13 +108,6 @@ def _unloaded(axes: Axes, strip: Strip, norm: Normalize) -> None:
     axes.set_title("Load0", color=INK, pad=4, **FONT)
     name_sides(axes, LETTERS[strip.plane], **ON_DARK)
     scale_bar(axes, strip.extent_mm[1] - strip.extent_mm[0], **ON_DARK)
-
-
-def _highest(strips: Sequence[Strip], rows: Sequence[str]) -> float:
-    """Upper end of the colours: the 98th percentile of all that is drawn, rounded up to 0.05; at least 0.1."""
-    pages = [strip.max_shear[name] for strip in strips for name in rows if name in strip.max_shear]
-    known = np.concatenate([page[np.isfinite(page)] for page in pages]).astype(np.float64)
-    return max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
 
 
 def _paint(axes: Axes, strip: Strip, name: str | None, norm: Normalize) -> None:

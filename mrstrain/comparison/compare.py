@@ -16,6 +16,7 @@ from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
+from dvc.measurement.side_by_side import shared_scale
 from dvc.measurement.subject import bones_of
 from dvc.report.page import Section
 from dvc.threads import usable_cores
@@ -165,8 +166,9 @@ def compare(
             said = methods(folders, of_models, result, criteria)
             held = [credibility_section(Holdings.of(result, {name: path.parent for name, path in of_models.items()}))]
             parts = result.write(
-                target, record=record, methods=said, more=held, on_image=comparison.on_image, each=writing_each
-            )
+                target, record=record, methods=said, more=held, on_image=comparison.on_image, each=writing_each,
+                largest=shared_scale(folders.values()),
+            )  # fmt: skip
     return Compared(target, result, *parts, taken if progress is None else ())
 
 
