@@ -169,18 +169,19 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
     return Table("Maximum shear strain by region", columns, rows, note)
 
 
+def estimates(row: RegionRow, intervals: Sequence[Interval]) -> tuple[Estimate, Estimate]:
+    """Median and 95th percentile of the maximum shear strain of a region, each with its interval where it is known."""
+    known = {i.statistic: (i.low, i.high) for i in intervals if i.region == row.region and not np.isnan(i.low)}
+    return Estimate(row.median, known.get("median")), Estimate(row.p95, known.get("p95"))
+
+
 def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval], caveat: str = "") -> Table:
     """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known.
 
     The ``caveat``, a sentence on the intervals, stands in its note.
     """
-    known = {(i.region, i.statistic): (i.low, i.high) for i in intervals if not np.isnan(i.low)}
-
-    def cells(r: RegionRow) -> tuple[Cell, ...]:
-        median, high = (known.get((r.region, figure)) for figure in ("median", "p95"))
-        return r.region, Estimate(r.median, median), Estimate(r.p95, high)
-
-    rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
+    rows = tuple((r.region, *estimates(r, intervals)) for r in regions if r.quantity == "max_shear")
+    known = any(not np.isnan(i.low) for i in intervals)
     note = f"In brackets: interval of 95 % coverage, from the error model. {LOPSIDED}" if known else ""
     if bare := dict.fromkeys(i.region for i in intervals if np.isnan(i.low)):
         note = f"{note} No interval in {', '.join(bare)}: its coverage is known to be below 90 %."

@@ -26,7 +26,7 @@ from dvc.trust.verdict import worst
 from mrstrain.comparison.credibility import TITLE as CREDIBILITY
 from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.measurement.acquisition import ACQUIRED, acquisition_section, acquisition_sentence
-from mrstrain.measurement.answer import MeasuredBeside
+from mrstrain.measurement.answer import MeasuredBeside, in_short
 from mrstrain.options.measurement import MeshAndAxes
 from mrstrain.options.modelling import Directions
 from mrstrain.records.inputs import read_subject
@@ -79,7 +79,10 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     verdict = _verdict([s.verdict.among(s.title) for s in of_loads if s.verdict], compared)
     judged = WITH_MODELS if any(one.verdict for one in compared[:1]) else MEASUREMENT
     lines, notes = record_lines(record), _incomplete(outcomes)
-    write_report(path, study.study.name, verdict, sections, closing, lines, judged=judged, notes=notes)
+    short = in_short(answer)
+    write_report(
+        path, study.study.name, verdict, sections, closing, lines, judged=judged, answer=short, notes=notes
+    )  # fmt: skip
 
 
 def _folders(study: Study, outcomes: Mapping[str, StageOutcome]) -> dict[str, Path]:

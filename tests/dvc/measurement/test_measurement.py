@@ -105,7 +105,10 @@ def test_arrays_in_and_arrays_out(measured, tiny_pair):
     assert measured.sigma is not None
     assert {i.region for i in measured.intervals} >= {"fat", "muscle"}
     assert str(measured).startswith(f"Load1: {measured.verdict.words}.\n")
-    assert "maximum shear strain (E1 - E3)/2, median / 95th percentile: " in str(measured)
+    fat = {i.statistic: f"{i.found:.3f} ({i.low:.3f} to {i.high:.3f})" for i in measured.intervals if i.region == "fat"}
+    line = "maximum shear strain (E1 - E3)/2, median / 95th percentile (95 % interval): "
+    assert line in str(measured)
+    assert f"fat {fat['median']} / {fat['p95']}" in str(measured)
 
 
 def test_true_fields_can_be_drawn_also_from_a_folder(measured, written, stretched):
