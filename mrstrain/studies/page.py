@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from dvc import Verdict
+from dvc import Subject, Verdict
 from dvc.atomic_files import write_json
 from dvc.errors import MrstrainError
 from dvc.io.result_folder import PROVENANCE
 from dvc.measurement.page import STRAIN
 from dvc.measurement.side_by_side import FIGURE, measured_by_load, on_one_scale
-from dvc.measurement.subject import Subject
 from dvc.report.page import (
     MEASUREMENT,
     METHODS,

@@ -79,6 +79,13 @@ def test_on_a_narrow_screen_the_strains_come_first_in_two_columns(subject: Subje
     assert small.x1 < below.x0
     assert max(right.x1, below.x1) <= 1.0
     assert drawing.narrow.get_size_inches()[0] < 4.5
+    assert [sum(line.get_linewidth() == 2.5 for line in axes.lines) for axes in (first, second, unloaded)] == [1, 0, 0]
+    one = measured_by_load(subject, {"Load1": folders["Load1"]}).narrow
+    assert one is not None
+    alone, unloaded, bar = one.axes
+    assert alone.get_position().width > 0.8  # a single load fills the width
+    assert unloaded.get_position().width < 0.35
+    assert unloaded.get_position().x1 < bar.get_position().x0
 
 
 def test_pictures_of_single_loads_get_the_colours_of_the_load_with_most_strain(
