@@ -100,7 +100,7 @@ def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None
     model = result("half", mesh, sheared(0.2))
     one = compare_load(case("Load1", sheared(0.4), [model]), bone)
     grid = replace(bone.grid, origin_mm=bone.grid.origin_mm + np.array([0.0, 0.0, aside]))
-    pictures, _, _ = draw(replace(one, labels=replace(bone, grid=grid)), ["half"], None)
+    pictures, _, _ = draw(replace(one, labels=replace(bone, grid=grid)), ["half"], None, 0.5)
     assert words in pictures["slices"].caption
 
 
