@@ -107,8 +107,10 @@ class Slice:
     face: tuple[float, float] | None = None  # height along the normal force at shear coordinate 0; slope
 
 
-def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> Figure:
-    """Fields in one slice, with one colour scale that ends at the 99th percentile (by volume).
+def slice_sheet(
+    mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_mm: FloatArray, largest: float | None = None
+) -> Figure:
+    """Fields in one slice, with one colour scale that ends at ``largest``, or the 99th percentile (by volume).
 
     Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left. ``axes`` (3,
     3) are those of the plate: columns are the directions of the normal force (up), of shear (to the right, or to the
@@ -117,10 +119,12 @@ def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_
     """
     side, axes = float(across_page(axes) @ axes[:, 1]), _on_page(axes)
     cuts = [cut(mesh, field.u_mm, axes, point_mm) for field in fields]
-    shears = np.concatenate([field.max_shear for field in fields])
-    known = np.isfinite(shears)
-    (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(fields))[known], [0.99])
-    norm = Normalize(0.0, max(0.05, float(np.ceil(20.0 * most) / 20.0)))
+    if largest is None:
+        shears = np.concatenate([field.max_shear for field in fields])
+        known = np.isfinite(shears)
+        (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(fields))[known], [0.99])
+        largest = max(0.05, float(np.ceil(20.0 * most) / 20.0))
+    norm = Normalize(0.0, largest)
     shades = colormaps["viridis"].with_extremes(bad=_UNKNOWN)
     corners = [corner for _, polygons in cuts for corner in polygons]
     figure, spots, bar = _slice_panels([field.title for field in fields], corners, axes)

@@ -29,7 +29,7 @@ from dvc.report.page import (
 from dvc.report.strips import Strip
 from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
-from validate import figures, tables
+from validate import figures, report, tables
 from validate.agreement import Agreement, SkinDisplacement
 from validate.comparison_error import ComparisonError
 from validate.curves import Area, range_told
@@ -41,7 +41,7 @@ from validate.mapping import ALL
 from validate.mavm import ModelForm
 from validate.misfit import Misfit, check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
-from validate.report import Drawn, area_rows, closing_sections, draw, drawings_of_all, load_sections, overview, shown
+from validate.report import Drawn, area_rows, closing_sections, drawings_of_all, load_sections, overview, shown
 from validate.tables import Curve
 
 _COVERED = 0.9  # fraction of the mesh; a model that covers less is noted
@@ -161,7 +161,7 @@ class Comparison:
 
     def write(
         self, folder: Path | str, *, record: Mapping[str, object] | None = None, methods: Sequence[str] = (),
-        more: Sequence[Section] = (), on_image: bool = False, each: Each = map,
+        more: Sequence[Section] = (), on_image: bool = False, largest: float | None = None, each: Each = map,
     ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:  # fmt: skip
         """Write tables, fields, figures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
@@ -179,6 +179,8 @@ class Comparison:
             Further closing sections of the report, before the methods text.
         on_image : bool
             Also write each model's displacement and maximum shear strain on the voxels of the label map.
+        largest : float, optional
+            Where the colours of the maximum shear strain end; by default as in `mrstrain.register`, in these cells.
         each : callable
             As in `validate.compare`.
 
@@ -196,12 +198,11 @@ class Comparison:
         target.mkdir(parents=True, exist_ok=True)
         tables.remove_earlier(target, list(self.coverage_ml))
         about = dict(record) if record is not None else {"parameters": {"strains": list(self.strains)}}
-        models = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
         notes = [note for note in self.notes if note not in _doubts(self.verdict)]
-        drawn = partial(draw, models=models, image=self.loads[0].case.image)
+        drawn, ends = report.drawing_of(self.loads, largest)
         write_one = partial(_write_load, folder=target, drawn=drawn, about=about, on_image=on_image)
         parts, strips = zip(*each(write_one, self.loads), strict=True)
-        of_all = drawings_of_all(strips, self.curves, self.strains, self.ranking)
+        of_all = drawings_of_all(strips, self.curves, self.strains, self.ranking, ends)
         pictures = [drawing.save(target / stem) for stem, drawing in of_all.items()]
         first = overview(self.loads, self.ranking, self.warnings, notes, pictures)
         sections = [first, *(section for part in parts for section in part)]

@@ -98,16 +98,16 @@ def areas_by_load(areas: Sequence[Area]) -> Figure:
     return figure
 
 
-def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray) -> Figure:
+def slices(
+    one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray, largest: float
+) -> Figure:
     """Maximum shear strain in a slice, measured and simulated, on the deformed tissue.
 
-    The slice contains the plate's normal and the direction of shear. All panels show the same cells with one colour
-    scale; grey is undefined. The scale ends at the 99th percentile (by volume) under this load, rounded up to the next
-    multiple of 0.05: it may differ from those of other loads and of other figures. Nodes outside the measurement are
-    drawn with the displacement of the nearest node inside. Letters name the sides of the body: A anterior, P posterior,
-    S superior, I inferior, R right, L left.
+    The slice contains the plate's normal and the direction of shear. All panels show the same cells; grey is undefined.
+    Nodes outside the measurement are drawn with the displacement of the nearest node inside. Letters name the sides of
+    the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    return slice_sheet(one.fields.mesh, slice_panels(one.fields, measured, u_mm), one.case.axes, point_mm)
+    return slice_sheet(one.fields.mesh, slice_panels(one.fields, measured, u_mm), one.case.axes, point_mm, largest)
 
 
 def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str, FloatArray]) -> list[Slice]:

@@ -10,6 +10,7 @@ from scipy.special import stdtrit
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
+from fe.result import volume_percentiles
 from validate.curves import Area, Band, range_told
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, LoadComparison
@@ -20,7 +21,7 @@ Pairs = tuple[tuple[str, str], ...]
 """Of models, each in the order of their areas."""
 
 ALL_LOADS = "all loads"
-_SURE, _LEVEL = 0.95, 0.975
+_SURE, _LEVEL, _HIGH = 0.95, 0.975, 0.95
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +33,8 @@ class Ranking:
     areas, nothing : tuple of Area, Area
         Over all loads: of the models that have every load, best first and levelled ones last; and of `NOTHING`.
     statements : tuple of str
-        The best match and the significant differences, over all loads, then under each load.
+        The best match and the significant differences, over all loads, then under each load. Of a load whose area is
+        not informative: how many times the measured strain each model predicts, and that it is not.
     not_distinguishable : mapping of load to Pairs
         Pairs whose areas do not differ significantly; those over all loads under `ALL_LOADS`.
     uninformative : tuple of str
@@ -78,7 +80,11 @@ def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ())
     pairs = {ALL_LOADS: _pairs(ranked, informative)}
     pairs |= {one.load: _pairs(one.ranked(), None if one.hardly_strained else one.bands.get(ALL)) for one in loads}
     many = len(loads) > 1 and bool(ranked) and informative is not None
-    statements = [_under(one, pairs[one.load], odd, many) for one in sorted(loads, key=lambda one: one.hardly_strained)]
+    weak = [one for one in loads if one.hardly_strained]
+    statements = [_under(one, pairs[one.load], odd, many) for one in loads if one not in weak]
+    # First what a model predicts under the load with most strain, as a report shows two paragraphs above its pictures.
+    statements += [_by_percentile(one) for one in sorted(weak, key=lambda one: -_high(one, "measured"))]
+    statements += [_under(one, pairs[one.load], odd, many) for one in weak]
     if many:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
         caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
@@ -136,6 +142,37 @@ def _under(one: LoadComparison, pairs: Pairs, odd: Sequence[Misfit], brief: bool
     known = ALL in one.bands
     strains = None if brief else one.criteria.strains
     return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat, strains) if known else ""
+
+
+def _by_percentile(one: LoadComparison) -> str:
+    """How many times the measured strain each model predicts, where the area is not informative; empty without any.
+
+    By its 95th percentile a model without deformation is wrong by the measured strain, so one that predicts twice the
+    measured strain or more is no better.
+    """
+    models = [area.model for area in one.ranked()]
+    high, measured = {name: _high(one, name) for name in models}, _high(one, "measured")
+    if not models or not measured > 0.0:
+        return ""
+    first, *others = (f"{_times(high[name] / measured)} times" for name in models)
+    shown = f"95th percentile in all soft tissue: {high[models[0]]:.3f} against {measured:.3f}"
+    told = [f"{one.load}: {models[0]} predicts {first} the measured strain ({shown})"]
+    told += [f"{name} {times} ({high[name]:.3f})" for name, times in zip(models[1:], others, strict=True)]
+    worse = [name for name in models if high[name] >= 2.0 * measured]
+    no_better = "no better than a model without deformation"
+    tail = "" if not worse else f", {no_better}" if len(models) == 1 else f"; {no_better}: {', '.join(worse)}"
+    return f"{', '.join(told)}{tail}."
+
+
+def _high(one: LoadComparison, name: str) -> float:
+    """The 95th percentile (by volume) of the maximum shear strain of a field in the compared cells."""
+    where = one.fields.common
+    shear, volumes = one.fields.by_name[name].max_shear[where], one.fields.volumes_ml[where]
+    return volume_percentiles(shear, volumes, [_HIGH])[0]
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.1f}" if ratio < 10.0 else f"{ratio:.0f}"
 
 
 def _statement(

@@ -1,7 +1,8 @@
 """The report of a comparison: verdict first, then the table of models and loads, curves, slices and agreement."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
 from dvc.report.alike import alike
 from dvc.report.drawing import Drawing
+from dvc.report.figures import scale_told, shear_scale
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from dvc.report.strips import MEASURED, Strip, narrow_by_load, strain_by_load
 from dvc.trust.verdict import together
@@ -66,8 +68,20 @@ Drawn = tuple[dict[str, Drawing], Viewer, Strip]
 """Figures of a load, by the stem of their files, its viewer, and its part of the first figure of the report."""
 
 
-def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Drawn:
-    """Draw a load; ``models`` are those of all loads, ``image`` is the anatomy in all viewers."""
+def drawing_of(
+    loads: Sequence[LoadComparison], largest: float | None = None
+) -> tuple[Callable[[LoadComparison], Drawn], float]:
+    """`draw` for each of the loads, and where the colours of all their maps of the maximum shear strain end."""
+    ends = largest or shear_scale(*(one.fields.measured.max_shear for one in loads))
+    models = list(dict.fromkeys(name for one in loads for name in one.fields.models))
+    return partial(draw, models=models, image=loads[0].case.image, largest=ends), ends
+
+
+def draw(one: LoadComparison, models: Sequence[str], image: Path | None, largest: float) -> Drawn:
+    """Draw a load; ``models`` are those of all loads, ``image`` is the anatomy in all viewers.
+
+    The colours of all maps of the maximum shear strain end at ``largest``.
+    """
     measured, results = one.case.read()
     fields, axes = one.fields, one.case.axes
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
@@ -78,7 +92,7 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
     across = (fields.mesh.points_mm - point) @ axes[:, 2]
     if not across.min() < 0.0 < across.max():
         point, through = middle, f"The slice goes through the middle of the mesh, since {_place(one)} is outside of it."
-    slices = one, measured, displacements, point
+    slices, through = (one, measured, displacements, point, largest), f"{through} {scale_told(largest, shared=True)}"
     agreement = figures.agreement_bins(fields)
     drawings = {
         "curves": Drawing.of(
@@ -97,7 +111,7 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None) -> Draw
         drawings[stem] = Drawing.of(title, figures.differences, bins, one, quantity, data=data)
     if (of_coefficients := standards.drawing(one, models)) is not None:
         drawings[_COEFFICIENTS] = of_coefficients
-    return drawings, _viewer(one, measured, results, image), strip_of(one, measured, results, lowest)
+    return drawings, _viewer(one, measured, results, image, largest), strip_of(one, measured, results, lowest)
 
 
 def _place(one: LoadComparison) -> str:
@@ -119,7 +133,9 @@ def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
     return filled_from_nearest(result.deformation.displacement(points_mm), points_mm)
 
 
-def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResult], scanned: Path | None) -> Viewer:
+def _viewer(
+    one: LoadComparison, measured: Deformation, results: Sequence[FeResult], scanned: Path | None, most: float
+) -> Viewer:
     """Measured strain and that of the best model over an image, or over the label map, on its voxels."""
     labels = one.labels
     box = Mask(labels.grid, labels.labels > 0).box(_AROUND)
@@ -136,7 +152,6 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
     if scanned is not None:
         seen, voxels = read_voxels(scanned)
         shown = np.nan_to_num(voxels[box]) if seen.same_as(labels.grid) else shown
-    most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
     return Viewer(
         "Interactive 3-D viewer",
         f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and simulated by {model.name}. "
@@ -169,15 +184,16 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
 
 
 def drawings_of_all(
-    strips: Sequence[Strip], curves: Sequence[Curve], strains: tuple[float, float], ranking: Ranking
+    strips: Sequence[Strip], curves: Sequence[Curve], strains: tuple[float, float], ranking: Ranking, largest: float
 ) -> dict[str, Drawing]:
     """The first figures of a report, by the stem of their files: slices and curves under all loads."""
     model = ranking.areas[0].model if ranking.areas else next(n for n in strips[0].max_shear if n != MEASURED)
     informative = ranking.areas and ALL_LOADS not in ranking.uninformative
     only = sum(not area.levelled for area in ranking.areas) == 1
     best = "the only model" if only else "the best match over all loads" if informative else "a model"
-    note = f"Measured, and simulated by {model}, {best}. {strips[0].title}, through {strips[0].place}."
-    slices, of_all = (strips, (MEASURED, model)), [curve for curve in curves if curve.tissue == ALL]
+    note = f"Measured, and simulated by {model}, {best}. {strips[0].title}, through {strips[0].place}. "
+    note += scale_told(largest, shared=True)
+    slices, of_all = (strips, (MEASURED, model), largest), [curve for curve in curves if curve.tissue == ALL]
     first = Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note)
     return {
         "slices_by_load": replace(first, narrow=narrow_by_load(*slices)),

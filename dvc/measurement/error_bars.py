@@ -1,6 +1,7 @@
 """The error bars of a registered load: its preset's error model applied to its strain map."""
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
@@ -178,12 +179,21 @@ def error_bars(
     other = "" if own == voxel else f" (these images: voxels of {own} mm)"
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
-        f"{chosen.source}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies to tissue "
-        "that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
+        f"{_in_words(chosen.source)}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies "
+        "to tissue that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
     )
     told = " ".join((told, *gaps))
     used, beyond = _used(chosen, table, wider), table.beyond(larger, snr)
     return ErrorBars(sure, told, used, rows, _of_twin(rows, twin), beyond)
+
+
+def _in_words(source: str) -> str:
+    """What an error model was measured on, without what only repeats it, and with motions in words.
+
+    >>> _in_words("54 registrations of phantom heels, seeds [9000, 9001], motions Load1, attached-Load1")
+    '54 registrations of phantom heels, motions Load1, Load1 with tissue attached to bone'
+    """
+    return re.sub(r"attached-(\w+)", r"\1 with tissue attached to bone", re.sub(r", seeds \[[^]]*\]", "", source))
 
 
 def _wider(rows: Sequence[Judged]) -> dict[str, float]:

@@ -238,10 +238,11 @@ class Measurement:
 
     @property
     def strain_line(self) -> str:
-        """The maximum shear strain by region, in a line."""
+        """The maximum shear strain by region, with intervals of 95 % coverage where they are known, in a line."""
         rows = (r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median))
-        shear = ", ".join(f"{r.region} {r.median:z.3f} / {r.p95:z.3f}" for r in rows)
-        return f"maximum shear strain (E1 - E3)/2, median / 95th percentile: {shear}"
+        each = [f"{r.region} {median} / {high}" for r in rows for median, high in [page.estimates(r, self.intervals)]]
+        known = " (95 % interval)" if any(np.isfinite(i.low) for i in self.intervals) else ""
+        return f"maximum shear strain (E1 - E3)/2, median / 95th percentile{known}: {', '.join(each)}"
 
     @property
     def headline(self) -> str:
@@ -250,7 +251,7 @@ class Measurement:
         if not rows:
             return f"no maximum shear strain; {self.verdict.words}"
         most = max(rows, key=lambda r: r.median * r.volume_ml)
-        strain = f"{most.median:z.3f} median, {most.p95:z.3f} at the 95th percentile"
+        strain = "{} median, {} at the 95th percentile".format(*page.estimates(most, self.intervals))
         return f"max. shear in {most.region} {strain}; {self.verdict.words}"
 
     def summary(self) -> list[str]:
@@ -289,7 +290,7 @@ class Measurement:
         point_mm : (3,), optional
             Point where the planes meet, LPS mm; by default the lowest point of the bone, or the middle of the tissue.
         largest : float, optional
-            Upper end of the colour scale, in the unit of the quantity.
+            Upper end of the colour scale, in the unit of the quantity; by default just above the 99th percentile.
 
         Raises
         ------
@@ -300,7 +301,7 @@ class Measurement:
         """
         view, values = self._view(point_mm), self._values_of(quantity)
         outline = None if self.source is None else self.source.subject.labels
-        scale = Scale.of(quantity, view.shown(values), largest)
+        scale = Scale.of(quantity, values if quantity == "max_shear" else view.shown(values), largest)
         return coloured(view, self.image, values, scale, planes=planes, outline=outline).finished()
 
     def _values_of(self, quantity: str) -> Float32Array:
@@ -374,8 +375,7 @@ class Measurement:
                 writing.append(pool.submit(error_files.write_uncertainty, partial, grid, sure, bars.model, verdict))
             if (mesh := made.subject.mesh) is not None:  # in the same thread, as compiled kernels may not be in two
                 onto = pool.submit(files.write_mesh_results, partial, mesh, self.deformation, verdict)
-            place = partial / files.FIGURES
-            place.mkdir()
+            (place := partial / files.FIGURES).mkdir()
             pictures = {stem: one.save(place / stem) for stem, one in self.drawings().items()}  # while files are made
             write_regions_csv(partial / files.REGIONS, self.regions, verdict)
             for one in writing:

@@ -11,6 +11,7 @@ from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Image, LabelMap
 from dvc.measurement.error_bars import ErrorBars
 from dvc.measurement.judgement import Source
+from dvc.measurement.subject import Subject
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
 from dvc.report.drawing import Columns, Drawing
@@ -24,8 +25,8 @@ from dvc.trust.uncertainty import Interval
 
 STRAIN = "Maximum shear strain"
 """Title of the picture of the strain."""
-SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
-"""Upper ends of the colours for maximum shear strain and its standard deviation."""
+SIGMA_SCALE = 0.1
+"""Upper end of the colours for the standard deviation of the maximum shear strain."""
 FIXED_WEIGHTS = "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
 """In place of the table of weights, for a repeat scan."""
 _COMPONENTS = (
@@ -58,17 +59,8 @@ def drawings_of(
         drawn["overlay"] = Drawing.of("Before and after", figures.overlay, *pair)
         drawn["checkerboard"] = Drawing.of("Checkerboard", figures.checkerboard, *pair)
         drawn["similarity"] = Drawing.of("Local similarity of the images", figures.similarity_slices, *local)
-    strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
-    through = "Slices through the middle of the tissue."
-    if bone is not None:
-        through = "Slices through the point of the bone that is nearest to the plate."
-    through += f" The colour scale ends at {SHEAR_SCALE:g}, whatever the load."
-    shear = Drawing.of(STRAIN, figures.strain_slices, *strain, note=through)
-    if images is not None:
-        both = {"unloaded": reference, f"{loaded}, registered": Image(reference.grid, images.registered)}
-        bare = {name: figures.image_slices(view, image, *strain[2:]) for name, image in both.items()}
-        shear = replace(shear, beneath=tuple(bare.items()))
-    drawn["strain"] = shear
+    under = None if images is None else Image(reference.grid, images.registered)
+    drawn["strain"] = strain_drawing(view, made.subject, labels, maps.max_shear, under, loaded=loaded)
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
     data = _curve_columns(maps, labels)
     drawn["curves"] = Drawing.of("Strain-volume curves", figures.shear_curves, *curves, data=data)
@@ -79,6 +71,27 @@ def drawings_of(
         spread = view, reference, sigma, SIGMA_SCALE
         drawn["sigma"] = Drawing.of("Standard uncertainty of the maximum shear strain", figures.sigma_slices, *spread)
     return drawn
+
+
+def strain_drawing(
+    view: View, subject: Subject, labels: LabelMap, max_shear: Float32Array, registered: Image | None, *,
+    loaded: str, shared: float | None = None,
+) -> Drawing:  # fmt: skip
+    """The maximum shear strain, which fades to the images; its colours end where those of a whole report do, or fit.
+
+    ``shared`` is the end of the colours in all maps of a report.
+    """
+    largest = figures.shear_scale(max_shear) if shared is None else shared
+    through = "Slices through the middle of the tissue."
+    if subject.bone is not None:
+        through = "Slices through the point of the bone that is nearest to the plate."
+    shown, note = (max_shear, largest, labels), f"{through} {figures.scale_told(largest, shared=shared is not None)}"
+    drawing = Drawing.of(STRAIN, figures.strain_slices, view, subject.reference, *shown, note=note)
+    if registered is None:
+        return drawing
+    both = {"unloaded": subject.reference, f"{loaded}, registered": registered}
+    bare = {name: figures.image_slices(view, image, *shown) for name, image in both.items()}
+    return replace(drawing, beneath=tuple(bare.items()))
 
 
 def _curve_columns(maps: StrainMaps, labels: LabelMap) -> Columns:
@@ -156,18 +169,19 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
     return Table("Maximum shear strain by region", columns, rows, note)
 
 
+def estimates(row: RegionRow, intervals: Sequence[Interval]) -> tuple[Estimate, Estimate]:
+    """Median and 95th percentile of the maximum shear strain of a region, each with its interval where it is known."""
+    known = {i.statistic: (i.low, i.high) for i in intervals if i.region == row.region and not np.isnan(i.low)}
+    return Estimate(row.median, known.get("median")), Estimate(row.p95, known.get("p95"))
+
+
 def summary_table(regions: Sequence[RegionRow], intervals: Sequence[Interval], caveat: str = "") -> Table:
     """Median and 95th percentile of the maximum shear strain by tissue, each with its interval where it is known.
 
     The ``caveat``, a sentence on the intervals, stands in its note.
     """
-    known = {(i.region, i.statistic): (i.low, i.high) for i in intervals if not np.isnan(i.low)}
-
-    def cells(r: RegionRow) -> tuple[Cell, ...]:
-        median, high = (known.get((r.region, figure)) for figure in ("median", "p95"))
-        return r.region, Estimate(r.median, median), Estimate(r.p95, high)
-
-    rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
+    rows = tuple((r.region, *estimates(r, intervals)) for r in regions if r.quantity == "max_shear")
+    known = any(not np.isnan(i.low) for i in intervals)
     note = f"In brackets: interval of 95 % coverage, from the error model. {LOPSIDED}" if known else ""
     if bare := dict.fromkeys(i.region for i in intervals if np.isnan(i.low)):
         note = f"{note} No interval in {', '.join(bare)}: its coverage is known to be below 90 %."

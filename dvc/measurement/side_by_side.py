@@ -1,14 +1,18 @@
 """The loads of one subject side by side: the first figure of a report on measurements alone."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from dvc.io.result_folder import MAX_SHEAR, read_scalar
+from dvc.errors import MrstrainError
+from dvc.io.result_folder import MAX_SHEAR, REGISTERED, REPEAT, read_scalar
+from dvc.measurement.page import STRAIN, strain_drawing
 from dvc.measurement.subject import Subject
 from dvc.report.drawing import Drawing
+from dvc.report.figures import scale_told, shear_scale
+from dvc.report.page import Section
 from dvc.report.sheet import PLANES, View, levelled, window_of
 from dvc.report.strips import MEASURED, Strip, narrow_by_load, strain_by_load
 
@@ -43,5 +47,39 @@ def measured_by_load(subject: Subject, folders: Mapping[str, Path]) -> Drawing:
         shown = {MEASURED: np.where(soft, page, np.float32(np.nan))}
         strips.append(Strip(load, plane, view.extent_mm(plane), view.title(plane), where, image, outlines, shown))
     note = f"{strips[0].title}, through {where}."
-    drawn = Drawing.of("Maximum shear strain under each load", strain_by_load, strips, (MEASURED,), note=note)
-    return replace(drawn, narrow=narrow_by_load(strips, (MEASURED,)))
+    largest = shared_scale(folders.values())
+    drawn_of = strips, (MEASURED,), largest
+    note += f" {scale_told(largest, shared=True)}"
+    drawn = Drawing.of("Maximum shear strain under each load", strain_by_load, *drawn_of, note=note)
+    return replace(drawn, narrow=narrow_by_load(*drawn_of))
+
+
+def shared_scale(folders: Iterable[Path]) -> float:
+    """Where the colours of all maps of the maximum shear strain in a report end; errors as `measured_by_load`."""
+    return max((shear_scale(read_scalar(folder / MAX_SHEAR).values) for folder in folders), default=shear_scale())
+
+
+def on_one_scale(sections: Sequence[Section], subject: Subject, folders: Mapping[str, Path]) -> list[Section]:
+    """Sections of loads whose pictures of the strain all have the colours of `shared_scale`, drawn anew where not.
+
+    ``folders`` are those of the loads, by the sections' titles; a repeat scan has the colours of the loads. A picture
+    stays if its files are missing or damaged.
+    """
+    try:
+        scale = shared_scale(folder for folder in folders.values() if folder.name != REPEAT)
+        return [_on_scale(one, subject, folders[one.title], scale) if one.title in folders else one for one in sections]
+    except MrstrainError:
+        return list(sections)
+
+
+def _on_scale(section: Section, subject: Subject, folder: Path, scale: float) -> Section:
+    shear = read_scalar(folder / MAX_SHEAR, subject.reference.grid).values
+    if shear_scale(shear) == scale:
+        return section
+    body, registered = subject.body(), folder / REGISTERED
+    under = read_scalar(registered, subject.reference.grid) if registered.is_file() else None
+    view = View.through(subject.reference.grid, subject.lowest_bone_point_mm, np.isfinite(shear))
+    loaded = "repeat" if folder.name == REPEAT else "loaded"
+    drawing = strain_drawing(view, subject, subject.regions(body), shear, under, loaded=loaded, shared=scale)
+    pictures = [drawing.picture() if one.title == STRAIN else one for one in section.pictures]
+    return replace(section, pictures=tuple(pictures))

@@ -48,7 +48,13 @@ class Drawing:
 
     def save(self, stem: Path) -> Picture:
         """Write its files, as `save_figure`; the picture for a page."""
-        png = save_figure(stem, self.figure, self.data)
+        return self._picture(save_figure(stem, self.figure, self.data))
+
+    def picture(self) -> Picture:
+        """The picture for a page, without a file."""
+        return self._picture(png_bytes(self.figure))
+
+    def _picture(self, png: bytes) -> Picture:
         beneath = tuple((name, png_bytes(one)) for name, one in self.beneath)
         narrow = b"" if self.narrow is None else png_bytes(self.narrow)
         return Picture(self.title, self.caption, png, beneath, narrow)

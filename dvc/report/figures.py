@@ -39,6 +39,7 @@ _STAGES = ("After the rigid alignment", "After the whole registration")
 _CHECK_MM = 12.0
 _LINE_MM = 5.0
 _HIGHEST_SHEAR = 0.6
+_LEAST_SCALE, _MOST_SCALE = 0.05, 0.5  # ends of the colours of the maximum shear strain
 _DRAWN = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure
 _WRITTEN = np.linspace(0.0, _HIGHEST_SHEAR, 121)
 
@@ -124,7 +125,10 @@ class Scale:
 
     @classmethod
     def of(cls, quantity: str, values: Values, largest: float | None = None) -> Self:
-        """Colours of a quantity, to ``largest`` (positive), or to a round number that 99 % of its values lie within."""
+        """Colours of a quantity, to ``largest`` (positive), or to a round number that 99 % of its values lie within.
+
+        Those of the maximum shear strain end at `shear_scale`.
+        """
         if largest is not None and not largest > 0.0:
             raise InputError(f"The upper end of the colour scale (largest) must be positive; got {largest}.")
         component = f"Green-Lagrange strain, component {quantity} in LPS, no unit", "PuOr_r"
@@ -132,9 +136,34 @@ class Scale:
         if quantity == "jacobian":
             reach = largest or volume_reach(values)
             return cls(told, shades, 1.0 - reach, 1.0 + reach)
+        if quantity == "max_shear":
+            return cls(told, shades, 0.0, largest or shear_scale(values))
         known = np.empty(0) if largest else np.abs(values[np.isfinite(values)])
         end = largest or round_up(float(np.percentile(known, 99.0)) if known.size else 0.0)
         return cls(told, shades, 0.0 if quantity in _COLOURS else -end, end)
+
+
+def shear_scale(*fields: Values) -> float:
+    """Where the colours of the maximum shear strain end: just above the 99th percentile of the field with the largest.
+
+    Rounded up to the next multiple of 0.05, and from 0.05 to 0.5. Fields are arrays of any shape, NaN where undefined.
+
+    >>> shear_scale(np.array([0.02, 0.07]), np.array([0.11, np.nan])), shear_scale(np.array([0.9])), shear_scale()
+    (0.15, 0.5, 0.05)
+    """
+    known = [values[np.isfinite(values)] for values in fields]
+    most = max((float(np.percentile(values, 99.0)) for values in known if values.size), default=0.0)
+    return float(np.clip(np.ceil(20.0 * most - 1e-6) / 20.0, _LEAST_SCALE, _MOST_SCALE))
+
+
+def scale_told(end: float, *, shared: bool) -> str:
+    """Where the colours of the maximum shear strain end, for a caption; ``shared`` by all maps of a report, or not."""
+    all_maps = (
+        "All maps of the maximum shear strain in this report have one colour scale. It" if shared else "The scale"
+    )
+    of = "under the load with the largest strain, " if shared else ""
+    rule = f"the 99th percentile of the measured strain, {of}rounded up to the next multiple of 0.05 (at most 0.5)"
+    return f"{all_maps} ends at {end:g}: {rule}. Larger strain has the last colour."
 
 
 def round_up(value: float) -> float:

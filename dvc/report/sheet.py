@@ -35,7 +35,7 @@ OBLIQUE_DEG = 3.0
 _SIDES = ("RL", "AP", "IS")  # of the axes L, P, S: against it and along it
 _LEAST_SHARE = 0.3827  # cosine of 67.5 degrees: half-way between one letter and two
 UNSEEN = (0.16, 0.18, 0.30)  # a voxel without a value: neither black, which is dark tissue, nor a colour
-_GAP_IN, _TITLE_IN, _BAR_IN, _LEAST_WIDTH_IN = 0.10, 0.26, 0.62, 5.2
+_GAP_IN, _TITLE_IN, _BAR_IN, _LEAST_WIDTH_IN, _BESIDE_IN = 0.10, 0.26, 0.62, 5.2, 0.2
 _MARK = "#FFD54A"
 
 
@@ -155,7 +155,8 @@ class Sheet:
             top -= inches * max(heights)
             self.rows.append(row)
         length = min(4.2, 0.6 * width)
-        self._bar = ((width - length) / 2 / width, 0.42 / height, length / width, 0.13 / height)
+        left = min(indent + _BESIDE_IN, (width - length) / 2)  # on the left, where a narrow screen shows it
+        self._bar = (left / width, 0.42 / height, length / width, 0.13 / height)
 
     def paint(self, plane: Plane, axes: Axes, page: Values, **how: Any) -> None:
         """Lay a page down; whatever follows is drawn over it."""

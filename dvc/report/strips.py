@@ -21,7 +21,7 @@ from dvc.report.style import FONT, INK, ON_DARK, SMALL, WIDTH_IN
 MEASURED = "measured"
 _GAP_IN, _HEAD_IN, _SIDE_IN, _FOOT_IN, _TALLEST_IN = 0.06, 0.3, 0.3, 0.62, 3.2
 _NARROW_IN = 4.2  # width of what a screen of 400 pixels shows
-_SMALL = 0.6  # there, of the size of a slice, the unloaded image
+_SMALL, _SMALLEST_IN = 0.6, 1.3  # there, the unloaded image: of the size of a slice, and its largest width
 _COLOURS = colormaps["viridis"]
 
 
@@ -39,16 +39,14 @@ class Strip:
     max_shear: Mapping[str, Float32Array]  # by model, and of `MEASURED`; NaN where undefined
 
 
-def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
+def strain_by_load(strips: Sequence[Strip], rows: Sequence[str], largest: float) -> Figure:
     """Maximum shear strain under each load, in one slice of the unloaded anatomy.
 
     Load0 is the unloaded image, or its label map if there is no image. A anterior, P posterior, S superior, I
     inferior, R right, L left. White lines are the surfaces of the body and of the bones. Grey: strain is not defined
-    (not measured, or outside the mesh of a model). All slices of this picture have one colour scale, which ends at the
-    98th percentile of all that is shown, rounded up to the next multiple of 0.05; pictures of single loads have scales
-    of their own.
+    (not measured, or outside the mesh of a model).
     """
-    # A row for each name; they are those of `Strip.max_shear`.
+    # A row for each name; they are those of `Strip.max_shear`. The colours end at ``largest``.
     first, many = strips[0], len(rows) > 1
     left, right, bottom, top = first.extent_mm
     width_mm, height_mm = right - left, abs(top - bottom)
@@ -57,10 +55,11 @@ def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     inches = min(((WIDTH_IN - aside_in) / columns - _GAP_IN) / width_mm, _TALLEST_IN / height_mm)
     w, h = inches * width_mm, inches * height_mm
     size = aside_in + columns * (w + _GAP_IN), _HEAD_IN + len(rows) * (h + _GAP_IN) + _FOOT_IN
-    figure, norm = empty(size), Normalize(0.0, _highest(strips, rows))
+    figure, norm = empty(size), Normalize(0.0, largest)
     middle = _FOOT_IN + (len(rows) - 1) * (h + _GAP_IN) / 2
     unloaded = slice_panel(figure, (0.0, middle / size[1], w / size[0], h / size[1]))
     _unloaded(unloaded, first, norm)
+    scale_bar(unloaded, width_mm, **ON_DARK)
     for row, name in enumerate(rows):
         low = _FOOT_IN + (len(rows) - 1 - row) * (h + _GAP_IN)
         if many:
@@ -78,45 +77,40 @@ def strain_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
     return figure
 
 
-def narrow_by_load(strips: Sequence[Strip], rows: Sequence[str]) -> Figure:
+def narrow_by_load(strips: Sequence[Strip], rows: Sequence[str], largest: float) -> Figure:
     """The slices of `strain_by_load` in two columns, for a narrow screen; the unloaded image is small, and last."""
     first, many = strips[0], len(rows) > 1
     shown = [(strip, name) for strip in strips for name in rows]
-    columns = len(rows) if many else 2
+    columns = len(rows) if many else min(2, len(shown))
     lines = -(-len(shown) // columns)
     left, right, bottom, top = first.extent_mm
     width_mm, height_mm = right - left, abs(top - bottom)
-    inches = min(((_NARROW_IN + _GAP_IN) / columns - _GAP_IN) / width_mm, _TALLEST_IN / height_mm)
+    inches = min(((_NARROW_IN + _GAP_IN) / columns - _GAP_IN) / width_mm, _NARROW_IN / height_mm)
     w, h = inches * width_mm, inches * height_mm
-    foot_in = _HEAD_IN + max(_SMALL * h, _FOOT_IN)
+    small = min(_SMALL, _SMALLEST_IN / w)
+    foot_in = _HEAD_IN + max(small * h, _FOOT_IN)
     size = _NARROW_IN, lines * (h + _HEAD_IN) + foot_in
-    figure, norm = empty(size), Normalize(0.0, _highest(strips, rows))
+    figure, norm = empty(size), Normalize(0.0, largest)
     for number, (strip, name) in enumerate(shown):
         line, column = divmod(number, columns)
         low = size[1] - (line + 1) * (h + _HEAD_IN)
         axes = slice_panel(figure, (column * (w + _GAP_IN) / size[0], low / size[1], w / size[0], h / size[1]))
         _paint(axes, strip, name, norm)
         axes.set_title(f"{strip.load}, {name}" if many else strip.load, color=INK, pad=4, **SMALL)
-    _unloaded(slice_panel(figure, (0.0, 0.0, _SMALL * w / size[0], _SMALL * h / size[1])), first, norm)
-    at = _SMALL * w + _SIDE_IN
+        if number == 0:  # a scale would cover a third of the small image
+            scale_bar(axes, width_mm, **ON_DARK)
+    _unloaded(slice_panel(figure, (0.0, 0.0, small * w / size[0], small * h / size[1])), first, norm)
+    at = small * w + _SIDE_IN
     bar = figure.add_axes((at / size[0], 0.42 / size[1], (size[0] - at - _SIDE_IN) / size[0], 0.12 / size[1]))
     colour_bar(bar, ScalarMappable(norm, _COLOURS), "max. shear strain, no unit", "max")
     return figure
 
 
 def _unloaded(axes: Axes, strip: Strip, norm: Normalize) -> None:
-    """Draw the unloaded image, with letters and a scale bar."""
+    """Draw the unloaded image, with letters."""
     _paint(axes, strip, None, norm)
     axes.set_title("Load0", color=INK, pad=4, **FONT)
     name_sides(axes, LETTERS[strip.plane], **ON_DARK)
-    scale_bar(axes, strip.extent_mm[1] - strip.extent_mm[0], **ON_DARK)
-
-
-def _highest(strips: Sequence[Strip], rows: Sequence[str]) -> float:
-    """Upper end of the colours: the 98th percentile of all that is drawn, rounded up to 0.05; at least 0.1."""
-    pages = [strip.max_shear[name] for strip in strips for name in rows if name in strip.max_shear]
-    known = np.concatenate([page[np.isfinite(page)] for page in pages]).astype(np.float64)
-    return max(0.1, float(np.ceil(20.0 * np.quantile(known, 0.98)) / 20.0)) if known.size else 0.1
 
 
 def _paint(axes: Axes, strip: Strip, name: str | None, norm: Normalize) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import validate
 from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
-from dvc.errors import InputError
+from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
 from dvc.measurement.subject import bones_of
 from dvc.report.page import Section
@@ -165,8 +165,9 @@ def compare(
             said = methods(folders, of_models, result, criteria)
             held = [credibility_section(Holdings.of(result, {name: path.parent for name, path in of_models.items()}))]
             parts = result.write(
-                target, record=record, methods=said, more=held, on_image=comparison.on_image, each=writing_each
-            )
+                target, record=record, methods=said, more=held, on_image=comparison.on_image, each=writing_each,
+                largest=_largest(folders.values()),
+            )  # fmt: skip
     return Compared(target, result, *parts, taken if progress is None else ())
 
 
@@ -177,6 +178,16 @@ def _told(each: Each, tell: Callable[[float], None], task: Callable[[Any], Any],
     for done, result in enumerate(each(task, those), start=1):
         tell(done / len(those))
         yield result
+
+
+def _largest(folders: Iterable[Path]) -> float | None:
+    """Where the colours of the measured strain end in its report; None if a map is missing."""
+    from dvc.measurement.side_by_side import shared_scale  # it draws, and matplotlib takes half a second
+
+    try:
+        return shared_scale(folders)
+    except MrstrainError:
+        return None
 
 
 def _at_once(loads: int) -> int:

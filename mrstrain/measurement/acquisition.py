@@ -35,7 +35,7 @@ _NOTE = (
     "known names of scanners and sequences, so that no patient is named. A study file can give the rest, under "
     "[acquisition]. SNR: 75th percentile of the signal in tissue, divided by the standard deviation of the noise. "
     "Standard uncertainty: standard deviation of the error about its bias. The spatial resolution was measured on "
-    "phantoms only (documentation, Benchmarks, Spatial resolution)."
+    "phantoms only."
 )
 _WEIGHTS = {"bending": "1/mm", "volume": "1/mm³", "rigidity": "1/mm³", "volume_gradient": "1/mm"}
 _SPLINE_ALONE = "none but the control point spacing"

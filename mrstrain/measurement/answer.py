@@ -11,10 +11,11 @@ from dvc.errors import InputError
 from dvc.io.result_folder import QUALITY
 from dvc.measurement.subject import is_bones_name
 from dvc.report.alike import alike
-from dvc.report.page import LOPSIDED, Estimate, Section, Table
+from dvc.report.page import LOPSIDED, Cell, Estimate, Section, Table
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
+_TITLE = "Measured maximum shear strain"
 _NEARLY = 0.9
 _INTERVALS = ", with the interval of 95 % coverage in brackets"
 
@@ -64,13 +65,10 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     It is the one with the largest 95th percentile of those whose interval begins within 10 % of the highest beginning:
     a tissue of few voxels may have a larger percentile by chance.
     """
-    rows = () if table is None else table.rows
-    known = [(high, row) for row in rows if isinstance(high := row[3], Estimate) and np.isfinite(high.value)]
+    known = _known(table)
     if not known:
         return ()
-    least = _NEARLY * max(high.least for high, _ in known)
-    likely = [one for one in known if one[0].least >= least]
-    high, (load, tissue, median, *_) = max(likely, key=lambda one: one[0].value)
+    high, (load, tissue, median, *_) = _most(known)
     under = f"{load} ({beside.forces[str(load)]})" if str(load) in beside.forces else str(load)
     several = len({row[1] for _, row in known}) > 1
     told = (
@@ -86,6 +84,34 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     if beside.floor is not None:
         told += f" The noise floor is {beside.floor.max_shear_p50:.3f} and {beside.floor.max_shear_p95:.3f}."
     return (told,)
+
+
+def in_short(sections: Sequence[Section]) -> str:
+    """The strain of the most strained tissue, for the banner of a report that begins with a table of `table_of_loads`.
+
+    Empty without such a table.
+    """
+    known = _known(next((table for table in sections[0].tables if table.title == _TITLE), None)) if sections else []
+    if not known:
+        return ""
+    high, (load, tissue, median, *_) = _most(known)
+    most = " (most strained)" if len(known) > 1 else ""
+    told = f"Maximum shear strain in {tissue} under {load}{most}: median {median}, 95th percentile {high}"
+    return f"{told}{'' if high.interval is None else ', with 95 % intervals'}."
+
+
+_Strained = tuple[Estimate, tuple[Cell, ...]]
+
+
+def _known(table: Table | None) -> list[_Strained]:
+    """The 95th percentile of each row of a table of `table_of_loads` that has one, and the row."""
+    rows = () if table is None else table.rows
+    return [(high, row) for row in rows if isinstance(high := row[3], Estimate) and np.isfinite(high.value)]
+
+
+def _most(known: Sequence[_Strained]) -> _Strained:
+    least = _NEARLY * max(high.least for high, _ in known)
+    return max((one for one in known if one[0].least >= least), key=lambda one: one[0].value)
 
 
 def table_of_loads(measured: Sequence[Section]) -> Table | None:
@@ -106,4 +132,4 @@ def table_of_loads(measured: Sequence[Section]) -> Table | None:
     if len({caveat for _, caveat in caveats}) > 1:
         caveats = [("", one) for one in alike(f"{load}: {caveat}" for load, caveat in caveats if caveat)]
     note = " ".join((note, *dict.fromkeys(caveat for _, caveat in caveats if caveat)))
-    return Table("Measured maximum shear strain", ("load", *tables[0][1].columns), rows, note)
+    return Table(_TITLE, ("load", *tables[0][1].columns), rows, note)

@@ -12,6 +12,7 @@ from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.report.page import Section, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.measurement.acquisition import acquisition_section
+from mrstrain.measurement.answer import in_short
 
 if TYPE_CHECKING:  # it draws, and matplotlib takes half a second: `Plan.register` loads it meanwhile
     from dvc import Measurement
@@ -113,7 +114,8 @@ class Series:
         told += [] if acquired is None else [acquired]
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
         title, notes = "Strain from MR image pairs", [*_images(record, cases), *([] if advice is None else [advice])]
-        write_report(out / REPORT, title, verdict, told, closing, record_lines(record), notes=notes)
+        lines, short = record_lines(record), in_short(first)
+        write_report(out / REPORT, title, verdict, told, closing, lines, answer=short, notes=notes)
         return cls(out, cases, failures, advice)
 
     @property

@@ -161,6 +161,10 @@ def register(
         run.all(at_once, registration.chain, first)
         finished = run.finished()
     tell(REPORT, WRITING, 0.0)
+    from dvc.measurement.side_by_side import on_one_scale  # it draws, and matplotlib takes half a second
+
+    alike = on_one_scale([case.section for case in finished], subject, {case.name: case.folder for case in finished})
+    finished = tuple(replace(case, section=section) for case, section in zip(finished, alike, strict=True))
     shown = [case for case in finished if case.name != REPEAT]
     answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
     advice = next_step(subject_files, cases, scans, registration, chosen)

@@ -20,7 +20,8 @@ _NEAREST = (
     "so another model may be best. In brackets: other models that are better than no deformation and may be as good, "
     "since their 95 % intervals overlap with that of the best match, or are not known; no significance test is made "
     "for a single tissue. None: no model is better than no deformation. A dash: hardly any of this tissue is strained"
-    " (less than 1 % above {low:g}), so its areas are not informative."
+    " (less than 1 % above {low:g}), so its areas are not informative. If that holds for a whole load, a sentence "
+    "above tells how many times the measured strain each model predicts."
 )
 
 

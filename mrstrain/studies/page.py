@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from dvc import Verdict
+from dvc import Subject, Verdict
 from dvc.atomic_files import write_json
 from dvc.errors import MrstrainError
 from dvc.io.result_folder import PROVENANCE
 from dvc.measurement.page import STRAIN
-from dvc.measurement.side_by_side import FIGURE, measured_by_load
+from dvc.measurement.side_by_side import FIGURE, measured_by_load, on_one_scale
 from dvc.report.page import (
     MEASUREMENT,
     METHODS,
@@ -25,7 +25,7 @@ from dvc.trust.verdict import worst
 from mrstrain.comparison.credibility import TITLE as CREDIBILITY
 from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.measurement.acquisition import ACQUIRED, acquisition_section, acquisition_sentence
-from mrstrain.measurement.answer import MeasuredBeside
+from mrstrain.measurement.answer import MeasuredBeside, in_short
 from mrstrain.options.measurement import MeshAndAxes
 from mrstrain.options.modelling import Directions
 from mrstrain.records.inputs import read_subject
@@ -45,8 +45,9 @@ _RELOAD_S = 10  # a browser shows the page anew, while a study runs
 
 def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutcome]) -> None:
     """Write the report of a study, a self-contained page, and ``provenance.json`` next to it."""
-    of_loads = {name: one.result for name, one in outcomes.items() if name.startswith("register ")}
-    registered = [replace(s, title=f"Registration of {s.title}") for of in of_loads.values() for s in of.sections]
+    subject = _subject(study)
+    of_loads = _of_loads(study, outcomes, subject)
+    registered = [replace(section, title=f"Registration of {section.title}") for section in of_loads]
     compared = [section for one in _of_kind(outcomes, "compare") for section in one.result.sections]
     labelled = [section for one in _of_kind(outcomes, "label") for section in one.result.sections]
     closing = [section for one in outcomes.values() for section in one.result.closing]
@@ -65,8 +66,8 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     stages = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in records.items()}
     write_json(path.with_name(PROVENANCE), record | {"stages": stages})
     against_truth = error_against_truth(study, outcomes)
-    of_each = [section for of in of_loads.values() for section in of.sections if section.title in study.loads]
-    pictures = [] if compared else _side_by_side(study, outcomes)
+    of_each = [section for section in of_loads if section.title in study.loads]
+    pictures = [] if compared or subject is None else _side_by_side(study, outcomes, subject)
     beside = MeasuredBeside.of(_folders(study, outcomes), study.forces)
     answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures, beside)
     scans = acquisition_section(_folders(study, outcomes), study.acquisition)
@@ -74,12 +75,13 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     credibility = study_credibility(study, outcomes)
     others = [*against_truth, *compared[1:], *registered, *labelled, *acquisition, *credibility, _stages(outcomes)]
     sections = [*answer, *(replace(section, folded=True) for section in others)]
-    verdict = _verdict(
-        [s.verdict.among(s.title) for of in of_loads.values() for s in of.sections if s.verdict], compared
-    )
+    verdict = _verdict([s.verdict.among(s.title) for s in of_loads if s.verdict], compared)
     judged = WITH_MODELS if any(one.verdict for one in compared[:1]) else MEASUREMENT
     lines, notes = record_lines(record), _incomplete(outcomes)
-    write_report(path, study.study.name, verdict, sections, closing, lines, judged=judged, notes=notes)
+    short = in_short(answer)
+    write_report(
+        path, study.study.name, verdict, sections, closing, lines, judged=judged, answer=short, notes=notes
+    )  # fmt: skip
 
 
 def _folders(study: Study, outcomes: Mapping[str, StageOutcome]) -> dict[str, Path]:
@@ -130,17 +132,34 @@ def _strain(section: Section) -> list[Picture]:
     return [replace(one, title=title, beneath=()) for one in section.pictures if one.title == STRAIN]
 
 
-def _side_by_side(study: Study, outcomes: Mapping[str, StageOutcome]) -> list[Picture]:
+def _subject(study: Study) -> Subject | None:
+    """What is drawn below the strain; None if one of its files is missing."""
+    onto = study.plate.narrowed(Directions)
+    try:
+        return read_subject(
+            study.path(study.images.load0), study.subject_files, MeshAndAxes(**onto.model_dump()),
+            allow_missing=study.images.allow_missing,
+        )  # fmt: skip
+    except (MrstrainError, OSError):
+        return None
+
+
+def _of_loads(study: Study, outcomes: Mapping[str, StageOutcome], subject: Subject | None) -> list[Section]:
+    """The sections of the registrations, their pictures of the strain with one colour scale."""
+    of = {name: one for name, one in outcomes.items() if name.startswith("register ")}
+    sections = [section for one in of.values() for section in one.result.sections]
+    if subject is None:
+        return sections
+    measured = [name.removeprefix("register ") for name, one in of.items() if one.record is not None]
+    return on_one_scale(sections, subject, {name: study.out / REGISTRATION / name for name in measured})
+
+
+def _side_by_side(study: Study, outcomes: Mapping[str, StageOutcome], subject: Subject) -> list[Picture]:
     """The picture of the measured strain of all loads; none if one of its files is missing."""
     measured = _folders(study, outcomes)
     if not measured:
         return []
     try:
-        onto = study.plate.narrowed(Directions)
-        subject = read_subject(
-            study.path(study.images.load0), study.subject_files, MeshAndAxes(**onto.model_dump()),
-            allow_missing=study.images.allow_missing,
-        )  # fmt: skip
         return [measured_by_load(subject, measured).save(study.out / REGISTRATION / FIGURE)]
     except MrstrainError:
         return []

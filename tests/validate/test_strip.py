@@ -62,7 +62,7 @@ def test_each_page_has_its_own_fields_strain_in_soft_tissue_alone(given: LabelMa
 def test_measured_stands_above_the_model_and_the_loads_side_by_side() -> None:
     strips = [strip(load, gamma, labels()) for load, gamma in (("Load1", 0.05), ("Load2", 0.9))]
     pixels = np.asarray(
-        Pixels.open(io.BytesIO(png_bytes(strain_by_load(strips, (MEASURED, "half"))))).convert("RGB"), dtype=float
+        Pixels.open(io.BytesIO(png_bytes(strain_by_load(strips, (MEASURED, "half"), 0.5)))).convert("RGB"), dtype=float
     )
     height, width = pixels.shape[:2]
     rows, columns = (int(0.25 * height), int(0.62 * height)), (int(0.52 * width), int(0.84 * width))
@@ -75,5 +75,7 @@ def test_measured_stands_above_the_model_and_the_loads_side_by_side() -> None:
 def test_a_load_without_the_model_says_so() -> None:
     strips = [strip(load, 0.4, labels()) for load in ("Load1", "Load2")]
     without = replace(strips[1], max_shear={MEASURED: strips[1].max_shear[MEASURED]})
-    both, one = (png_bytes(strain_by_load([strips[0], second], (MEASURED, "half"))) for second in (strips[1], without))
+    both, one = (
+        png_bytes(strain_by_load([strips[0], second], (MEASURED, "half"), 0.5)) for second in (strips[1], without)
+    )
     assert both != one

@@ -30,9 +30,9 @@ _NOTE = (
     "no spline with discontinuities."
 )
 _NOTE_AT_BONE = (
-    "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid. This surface is placed at "
-    "the dark rim of the bone in the unloaded image, up to 2.5 voxels from that of the mask; the key results of the bone "
-    "are those of the preceding smooth spline. The whole motion, that of the bone included, is in transform.h5, "
+    "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid. This surface is placed "
+    "at the dark rim of the bone in the unloaded image, up to 2.5 voxels from that of the mask; the key results of the "
+    "bone are those of the preceding smooth spline. The whole motion, that of the bone included, is in transform.h5, "
     "as displacements at voxels. No elastix text files are written, because elastix has no spline with discontinuities."
 )
 

@@ -105,7 +105,10 @@ def test_arrays_in_and_arrays_out(measured, tiny_pair):
     assert measured.sigma is not None
     assert {i.region for i in measured.intervals} >= {"fat", "muscle"}
     assert str(measured).startswith(f"Load1: {measured.verdict.words}.\n")
-    assert "maximum shear strain (E1 - E3)/2, median / 95th percentile: " in str(measured)
+    fat = {i.statistic: f"{i.found:.3f} ({i.low:.3f} to {i.high:.3f})" for i in measured.intervals if i.region == "fat"}
+    line = "maximum shear strain (E1 - E3)/2, median / 95th percentile (95 % interval): "
+    assert line in str(measured)
+    assert f"fat {fat['median']} / {fat['p95']}" in str(measured)
 
 
 def test_true_fields_can_be_drawn_also_from_a_folder(measured, written, stretched):
@@ -249,7 +252,8 @@ def test_images_that_were_aligned_as_a_whole_have_no_figures_of_a_bone(stretched
     assert "Rotation of the body" in rows["image"]
     assert "bone" not in rows["image"]
     assert stretched.drawings()["strain"].caption.endswith(
-        "Slices through the middle of the tissue. The colour scale ends at 0.5, whatever the load."
+        "Slices through the middle of the tissue. The scale ends at 0.1: the 99th percentile of the measured strain, "
+        "rounded up to the next multiple of 0.05 (at most 0.5). Larger strain has the last colour."
     )
 
 

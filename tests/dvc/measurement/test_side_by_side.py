@@ -11,8 +11,12 @@ import pytest
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image, Mask
 from dvc.io.images.write import write_image
-from dvc.measurement.side_by_side import measured_by_load
+from dvc.io.result_folder import read_scalar
+from dvc.measurement.page import strain_drawing
+from dvc.measurement.side_by_side import measured_by_load, on_one_scale, shared_scale
 from dvc.measurement.subject import Subject
+from dvc.report.page import Section
+from dvc.report.sheet import View
 
 GRID = Grid((10, 12, 14), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
 STRAINS = {"Load1": 0.05, "Load2": 0.31}
@@ -75,6 +79,36 @@ def test_on_a_narrow_screen_the_strains_come_first_in_two_columns(subject: Subje
     assert small.x1 < below.x0
     assert max(right.x1, below.x1) <= 1.0
     assert drawing.narrow.get_size_inches()[0] < 4.5
+    assert [sum(line.get_linewidth() == 2.5 for line in axes.lines) for axes in (first, second, unloaded)] == [1, 0, 0]
+    one = measured_by_load(subject, {"Load1": folders["Load1"]}).narrow
+    assert one is not None
+    alone, unloaded, bar = one.axes
+    assert alone.get_position().width > 0.8  # a single load fills the width
+    assert unloaded.get_position().width < 0.35
+    assert unloaded.get_position().x1 < bar.get_position().x0
+
+
+def test_pictures_of_single_loads_get_the_colours_of_the_load_with_most_strain(
+    subject: Subject, folders: dict[str, Path]
+) -> None:
+    def section(load: str) -> Section:
+        shear = read_scalar(folders[load] / "max_shear.nii.gz").values
+        view = View.through(GRID, subject.lowest_bone_point_mm, np.isfinite(shear))
+        drawing = strain_drawing(view, subject, subject.regions(subject.body()), shear, None, loaded="loaded")
+        return Section(load, pictures=(drawing.picture(),))
+
+    before = [section(load) for load in folders]
+    weak, strong = on_one_scale(before, subject, folders)
+    assert shared_scale(folders.values()) == 0.35
+    assert strong is before[1]  # its own scale ends there
+    assert "The scale ends at 0.05: " in before[0].pictures[0].caption
+    assert "one colour scale. It ends at 0.35: " in weak.pictures[0].caption
+    assert weak.pictures[0].png != before[0].pictures[0].png
+    repeat = {name: folder.rename(folder.with_name("repeat")) if name == "Load2" else folder
+              for name, folder in folders.items()}  # fmt: skip
+    assert on_one_scale(before, subject, repeat)[0] is before[0]  # a repeat scan has no say
+    (folders["Load1"] / "max_shear.nii.gz").unlink()
+    assert on_one_scale(before, subject, repeat) == before
 
 
 def test_the_slice_has_the_plates_normal_and_its_shear_in_it(subject: Subject, folders: dict[str, Path]) -> None:
@@ -87,7 +121,7 @@ def test_the_slice_has_the_plates_normal_and_its_shear_in_it(subject: Subject, f
 def test_without_a_bone_it_goes_through_the_middle(subject: Subject, folders: dict[str, Path]) -> None:
     titles, strains, caption = panels(replace(subject, bone=None), folders)
     assert titles[1:] == list(folders)
-    assert caption.endswith("through the middle of the tissue.")
+    assert "through the middle of the tissue. All maps of the maximum shear strain in this report have one" in caption
     assert strains[0].count() == 12 * 10 - 2 * 10  # of the body, without what is not valid
 
 

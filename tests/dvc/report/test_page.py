@@ -148,6 +148,10 @@ def test_verdict_stands_before_all_else_and_in_words(html: str) -> None:
 
 
 def test_a_verdict_without_reasons_says_once_what_it_means(tmp_path: Path) -> None:
+    for verdict in (TRUST, FOLDS):
+        write_report(tmp_path / "r.html", "A heel", verdict, [], (), {}, answer="The strain is 0.2 <b>.")
+        banner = (tmp_path / "r.html").read_text().split("<h1>")[1]
+        assert ("<p>The strain is 0.2 &lt;b&gt;.</p>" in banner) == (verdict is TRUST)
     write_report(tmp_path / "r.html", "A heel", TRUST, [Section("Load1", TRUST)], (), {})
     page = (tmp_path / "r.html").read_text()
     assert page.count('class="verdict trust"') == page.count("All checks passed. The verdict does not") == 1

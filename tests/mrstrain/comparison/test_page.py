@@ -100,7 +100,7 @@ def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None
     model = result("half", mesh, sheared(0.2))
     one = compare_load(case("Load1", sheared(0.4), [model]), bone)
     grid = replace(bone.grid, origin_mm=bone.grid.origin_mm + np.array([0.0, 0.0, aside]))
-    pictures, _, _ = draw(replace(one, labels=replace(bone, grid=grid)), ["half"], None)
+    pictures, _, _ = draw(replace(one, labels=replace(bone, grid=grid)), ["half"], None, 0.5)
     assert words in pictures["slices"].caption
 
 
@@ -135,10 +135,24 @@ def test_a_load_that_hardly_strains_does_not_judge_and_a_total_is_a_mean_of_shar
     assert max_shear(0.38) < 0.2 < max_shear(0.5)
     assert (weak.hardly_strained, strong.hardly_strained) == (True, False)
     ranking = rank_over_loads([weak, strong])
-    second, informative = [s for s in ranking.statements if "under Load" in s or s.startswith("Load")]
+    second, compared, informative = [s for s in ranking.statements if "under Load" in s or s.startswith("Load")]
     assert informative == f"Load1: {FEW}, so the area metric is not informative."
+    high = {name: max_shear(gamma) for name, gamma in {"a": 0.5, "b": 0.3, "measured": 0.38}.items()}
+    assert compared == (
+        f"Load1: b predicts {high['b'] / high['measured']:.1f} times the measured strain (95th percentile in all soft "
+        f"tissue: {high['b']:.3f} against {high['measured']:.3f}), a {high['a'] / high['measured']:.1f} times "
+        f"({high['a']:.3f})."
+    )
     assert second.startswith("Best match under Load2")
     assert ranking.uninformative == ("Load1",)
+    fourfold = [result("stiff", mesh, sheared(0.1)), result("soft", mesh, sheared(1.4))]
+    for models, tail in (
+        (fourfold, "; no better than a model without deformation: soft."),
+        (fourfold[1:], ", no better than a model without deformation."),
+        (fourfold[:1], ")."),
+    ):
+        one = compare_load(case("Load1", sheared(0.38), models, error_table(0.0, 0.001)), labels())
+        assert rank_over_loads([one]).statements[0].endswith(tail)
     alone = rank_over_loads([weak])
     assert (alone.uninformative, alone.rank("a")) == (("Load1", "all loads"), None)
     areas = {(a.model, a.load): a for one in (weak, strong) for a in one.areas if a.tissue == ALL}

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from dvc.measurement.page import summary_table
-from dvc.report.page import LOPSIDED, Estimate, Section, Table
+from dvc.report.page import LOPSIDED, Cell, Estimate, Section, Table
 from dvc.trust.quality import NoiseFloor
 from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
-from mrstrain.measurement.answer import MeasuredBeside, most_strained
+from mrstrain.measurement.answer import MeasuredBeside, in_short, most_strained
 from mrstrain.studies.answer import answer_of
 from tests.validate.test_comparison import case, cube, labels, result, sheared
 from validate import NOTHING, Area, Comparison, Criteria, compare
@@ -104,6 +104,19 @@ def test_the_most_strained_tissue_is_surely_so() -> None:
     )
     columns = ("load", "tissue", "median", "95th percentile")
     beside = MeasuredBeside({"Load1": "140 N"}, NoiseFloor(0.01, 0.01, 0.0112, 0.0292, 0.1))
+
+    def short(*rows: tuple[Cell, ...]) -> str:
+        return in_short([Section("Measured strain", None, (Table("Measured maximum shear strain", columns, rows),))])
+
+    assert short(*rows) == (
+        "Maximum shear strain in fat under Load1 (most strained): median 0.300 (0.200 to 0.400), 95th percentile 0.419 "
+        "(0.400 to 0.500), with 95 % intervals."
+    )
+    assert short(("Load1", "fat", Estimate(0.3), Estimate(0.41))).endswith(
+        "under Load1: median 0.300, 95th percentile 0.410."
+    )
+    assert "most strained" not in short(rows[0])
+    assert short() == in_short([]) == ""
     assert most_strained(Table("Measured", columns, rows), beside) == (
         "The most strained tissue is fat under Load1 (140 N): measured maximum shear strain 0.300 (0.200 to 0.400) in "
         "the median and 0.419 (0.400 to 0.500) at the 95th percentile, with 95 % intervals in brackets. It may be as "
