@@ -101,8 +101,8 @@ class MaterialSet:
             instead = f" (nor for {' or '.join(tried[1:])}, as a substitute)" if tried[1:] else ""
             raise InputError(
                 f"The material set {self.name} has no material for the region '{region}'{instead}; it has "
-                f"{few(self.materials, most=3)}. Write your own set (.toml) with it or rename the region; "
-                "a bone belongs to `bones` of the mesh (--bone, [mesh] bones)."
+                f"{few(self.materials, most=3)}. Write your own set (.toml) with it, rename the region, or "
+                "mesh it as a bone (bones, --bone)."
             )
         return name
 
