@@ -38,6 +38,10 @@ _OF_FLOOR = (
     "MAER is the mean over voxels of the mean absolute value of the six strain components; SDER is its standard "
     "deviation over voxels."
 )
+_OF_LENGTHS = (
+    "Wavelengths, to the nearest mm, are interpolated between those of the study (resolution.csv); a dash where even "
+    "the longest recovers less, or even the shortest more."
+)
 HOW_TO_READ = Section(
     "How to read this",
     paragraphs=(
@@ -184,6 +188,10 @@ def _told(cell: Cell) -> Cell:
     return round(cell, 3) if isinstance(cell, float) else cell
 
 
+def _whole_mm(length: float) -> int | None:
+    return round(length) if np.isfinite(length) else None
+
+
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
     shares = "voxels", "normal strain", "shear strain", "displacement", "statistics"
     columns = *_CONDITION, "motion", "tissue", "remaining error, mean", *(f"{name}, %" for name in shares)
@@ -206,10 +214,13 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
 def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], folder: Path) -> Section:
     table_rows = []
     for of_condition, still in _by_condition(rows, floors):
-        noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == POOLED), (None, None, None))
-        wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
-        table_rows.append((*of_condition[0].condition, *wavelengths, *noise))
-    columns = (*_CONDITION, "90 % at, mm", "50 % at, mm", "apparent max. shear, median", "MAER", "SDER")
+        for tissue in (*_TISSUES, POOLED):
+            of_tissue = [row for row in of_condition if row.tissue == tissue]
+            lengths = [_whole_mm(wavelength_recovered(of_tissue, fraction)) for fraction in (0.9, 0.5)]
+            noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == tissue), (None, None, None))
+            if of_tissue:
+                table_rows.append((*of_condition[0].condition, tissue, *lengths, *noise))
+    columns = (*_CONDITION, "tissue", "90 % at, mm", "50 % at, mm", "apparent max. shear, median", "MAER", "SDER")
     drawings = {"resolution": Drawing.of("Spatial resolution", figures.resolution, rows)}
     if known := figures.noise_and_resolution(floors, rows, POOLED):
         names = ("condition", "wavelength_recovered_to_90_percent_mm", "max_shear_without_load")
@@ -217,5 +228,6 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
         drawing = Drawing.of("Noise against resolution", figures.trade_off, known, POOLED, data=data)
         drawings["noise_and_resolution"] = drawing
     pictures = [drawing.save(folder / stem) for stem, drawing in drawings.items()]
-    table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows), _OF_FLOOR)
+    note = f"{_OF_LENGTHS} {_OF_FLOOR}"
+    table = Table("Spatial resolution and noise by tissue", columns, tuple(table_rows), note)
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

@@ -12,7 +12,16 @@ import pytest
 from dvc.report.page import Section
 from mrstrain.truth.accuracy_page import sections_of
 from mrstrain.truth.accuracy_study import AccuracyStudy
-from phantoms import TISSUES, AccuracyCase, ErrorSamples, coverage_rows, error_rows, floor_rows, resolution_rows
+from phantoms import (
+    TISSUES,
+    AccuracyCase,
+    ErrorSamples,
+    ResolutionRow,
+    coverage_rows,
+    error_rows,
+    floor_rows,
+    resolution_rows,
+)
 from tests.phantoms.test_error_tables import samples
 
 USUAL = AccuracyCase("gauss-newton", (0.8, 0.8, 0.8), 25.0, "smooth", 1)
@@ -93,6 +102,19 @@ def test_a_study_of_waves_alone_begins_with_their_resolution(tmp_path: Path) -> 
     (only,) = sections([in_three_tissues(replace(USUAL, motion="wave-24"))], tmp_path)
     assert only.title == "Spatial resolution"
     assert not only.folded
+
+
+def test_resolution_is_that_of_each_tissue_between_the_wavelengths_of_the_study(tmp_path: Path) -> None:
+    """Waves of all tissues in one list gave the longest one for soft tissue: "90 % at 48 mm"."""
+    condition = ("gauss-newton", "1.2", 15.0)
+    found = {"fat": (0.86, 0.93, 0.98), "skin": (0.6, 0.79, 0.87), "soft tissue": (0.69, 0.896, 0.952)}
+    rows = [
+        ResolutionRow(*condition, tissue, *at) for tissue, of in found.items() for at in zip((12, 24, 48), of, strict=True)
+    ]
+    (only,) = sections_of((), (), rows, (), {}, tmp_path)
+    (table,) = only.tables
+    assert table.columns[3:6] == ("tissue", "90 % at, mm", "50 % at, mm")
+    assert [row[3:6] for row in table.rows] == [("fat", 18, None), ("skin", None, None), ("soft tissue", 25, None)]
 
 
 def test_the_sentence_precedes_the_picture_and_the_picture_every_table(
