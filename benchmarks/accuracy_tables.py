@@ -81,9 +81,7 @@ class Results:
         """From which on a wave's shear is recovered to that share; NaN where it is not."""
         return wavelength_recovered(
             [
-                ResolutionRow(
-                    row["preset"], *condition, tissue, float(row["wavelength_mm"]), float(row["recovered"])
-                )
+                ResolutionRow(row["preset"], *condition, tissue, float(row["wavelength_mm"]), float(row["recovered"]))
                 for row in self.table("resolution.csv")
                 if (row["voxel_mm"], float(row["snr"])) == condition and row["tissue"] == tissue
             ],
