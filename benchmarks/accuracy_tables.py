@@ -13,8 +13,9 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
+
+from phantoms import ResolutionRow, wavelength_recovered
 
 STRAINED = ("smooth", "sliding", "Load1", "Load3")
 LOADED = ("smooth", "sliding", "Load1", "Load2", "Load3", "Load4")
@@ -78,18 +79,14 @@ class Results:
 
     def wavelength_mm(self, tissue: str, condition: tuple[str, float], share: float) -> float:
         """From which on a wave's shear is recovered to that share; NaN where it is not."""
-        found = sorted(
-            (float(row["wavelength_mm"]), float(row["recovered"]))
-            for row in self.table("resolution.csv")
-            if (row["voxel_mm"], float(row["snr"])) == condition and row["tissue"] == tissue
+        return wavelength_recovered(
+            [
+                ResolutionRow(row["preset"], *condition, tissue, float(row["wavelength_mm"]), float(row["recovered"]))
+                for row in self.table("resolution.csv")
+                if (row["voxel_mm"], float(row["snr"])) == condition and row["tissue"] == tissue
+            ],
+            share,
         )
-        if not found or found[-1][1] < share:
-            return math.nan
-        last = found[0][0]
-        for (short, below), (long, above) in pairwise(found):
-            if below < share <= above:
-                last = short + (long - short) * (share - below) / (above - below)
-        return last
 
     def coverage(self, condition: tuple[str, float]) -> tuple[float, float, float]:
         """Share of voxels within their interval: mean over motions and tissues, least, and most."""

@@ -274,15 +274,17 @@ def resolution_rows(runs: Sequence[ErrorSamples]) -> list[ResolutionRow]:
 def wavelength_recovered(rows: Sequence[ResolutionRow], share: float) -> float:
     """Shortest wavelength (mm) from which on a ``share`` of the strain is recovered; NaN outside the range of the rows.
 
-    Interpolated linearly between the rows, which are of one condition and tissue.
+    Between the rows, which are of one condition and tissue, the fraction is linear in the logarithm of the wavelength.
     """
+    if len({(r.preset, r.voxel_mm, r.snr, r.tissue) for r in rows}) > 1:
+        raise ValueError("the rows are of several conditions or tissues")
     lengths, recovered = np.array(sorted((r.wavelength_mm, r.recovered) for r in rows)).reshape(-1, 2).T
     below = np.flatnonzero(recovered < share)
     if not len(below) or below[-1] == len(rows) - 1:
         return float("nan")  # recovered even at the shortest, or not even at the longest
     i = int(below[-1])
     part = (share - recovered[i]) / (recovered[i + 1] - recovered[i])
-    return float(lengths[i] + part * (lengths[i + 1] - lengths[i]))
+    return float(lengths[i] * (lengths[i + 1] / lengths[i]) ** part)
 
 
 def by_condition(runs: Sequence[ErrorSamples]) -> Iterator[tuple[tuple[str, str, float], list[ErrorSamples]]]:

@@ -1,6 +1,6 @@
 """The page of an accuracy study: the errors at its usual condition first, then every table, folded."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from dvc import GaussNewton
 from dvc.registration.engines import DEFAULT
 from dvc.report.drawing import Drawing
 from dvc.report.page import Cell, Picture, Section, Table
@@ -38,6 +39,10 @@ _OF_FLOOR = (
     "MAER is the mean over voxels of the mean absolute value of the six strain components; SDER is its standard "
     "deviation over voxels."
 )
+_OF_LENGTHS = (
+    "Wavelengths, to the nearest mm, are interpolated between those of the study (resolution.csv); a dash where even "
+    "the longest recovers less, or even the shortest more."
+)
 HOW_TO_READ = Section(
     "How to read this",
     paragraphs=(
@@ -67,7 +72,7 @@ def sections_of(
     pictures = {condition: _pictures(condition, rows, folder) for condition, rows in by_condition.items()}
     answer, others = [], []
     if by_condition:
-        usual = max(by_condition, key=lambda one: [part == wanted for part, wanted in zip(one, _USUAL, strict=True)])
+        usual = _usual(by_condition)
         answer = [_answer(usual, by_condition, floors, tuple(pictures[usual][:1]))]
         pictures[usual] = pictures[usual][1:]
     for rows, still in _by_condition(errors, floors):
@@ -102,19 +107,43 @@ def _answer(
         tables.append(Table("RMSE of the max. shear by condition", (*_CONDITION, *_TISSUES), every))
     return Section(
         "Error of the maximum shear strain", tables=tuple(tables), pictures=pictures,
-        paragraphs=(_sentence(usual, rows),), pictures_first=True,
+        paragraphs=(_sentence(usual, by_condition[usual], floors),), pictures_first=True,
     )  # fmt: skip
 
 
-def _sentence(condition: _Condition, rows: Sequence[tuple[Cell, ...]]) -> str:
-    """The error and the noise floor of each tissue in one sentence, from the rows of the answer's table."""
+def answers(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> list[str]:
+    """The sentence that a page begins with, and the same for other presets at that voxel size and SNR."""
+    conditions = [of[0].condition for of, _ in _by_condition(errors, floors)]
+    if not conditions:
+        return []
+    usual = _usual(conditions)
+    beside = [one for one in conditions if one[1:] == usual[1:] and one != usual]
+    return [_sentence(one, [r for r in errors if r.condition == one], floors) for one in (usual, *beside)]
+
+
+def _usual(conditions: Iterable[_Condition]) -> _Condition:
+    """The condition that a page begins with."""
+    return max(conditions, key=lambda one: [part == wanted for part, wanted in zip(one, _USUAL, strict=True)])
+
+
+def _sentence(condition: _Condition, errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> str:
+    """The error of each tissue, with its range over motions, and the noise floor at one condition, in one sentence."""
     preset, voxel, snr = condition
-    error, floor = (
-        _listed([f"{row[column]:.3f} in {row[0]}" for row in rows if row[column] is not None]) for column in (1, 3)
-    )
-    told = [f"the max. shear has an error (RMSE) of {error}"] if error else []
-    told += [f"the noise floor (median) is {floor}"] if floor else []
-    return f"With {preset}, voxels of {voxel} mm and SNR {snr:g}, {'; '.join(told)}."
+    motions = {row.motion for row in errors if row.motion != "still"}
+    error = []
+    for tissue in _TISSUES:
+        mean = _over_motions(errors, tissue)[0]
+        if mean is not None:
+            each = [_over_motions([row for row in errors if row.motion == one], tissue)[0] for one in motions]
+            known = [one for one in each if one is not None]
+            spread = f" ({min(known):.3f} to {max(known):.3f})" if len(known) > 1 else ""
+            error.append(f"{mean:.3f}{spread} in {tissue}")
+    floor = [f"{f.shear_p50:.3f} in {f.tissue}" for f in floors if f.condition == condition and f.tissue in _TISSUES]
+    over = f" over {len(motions)} motions, with their range" if len(motions) > 1 else ""
+    told = [f"the max. shear has an error (RMSE{over}) of {_listed(error)}"] if error else []
+    told += [f"the noise floor (median) is {_listed(floor)}"] if floor else []
+    labels = " without a label map" if preset == GaussNewton.name else ""
+    return f"With {preset}{labels}, voxels of {voxel} mm and SNR {snr:g}, {'; '.join(told)}."
 
 
 def _listed(items: Sequence[str]) -> str:
@@ -184,6 +213,10 @@ def _told(cell: Cell) -> Cell:
     return round(cell, 3) if isinstance(cell, float) else cell
 
 
+def _whole_mm(length: float) -> int | None:
+    return round(length) if np.isfinite(length) else None
+
+
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
     shares = "voxels", "normal strain", "shear strain", "displacement", "statistics"
     columns = *_CONDITION, "motion", "tissue", "remaining error, mean", *(f"{name}, %" for name in shares)
@@ -206,10 +239,13 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
 def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], folder: Path) -> Section:
     table_rows = []
     for of_condition, still in _by_condition(rows, floors):
-        noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == POOLED), (None, None, None))
-        wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
-        table_rows.append((*of_condition[0].condition, *wavelengths, *noise))
-    columns = (*_CONDITION, "90 % at, mm", "50 % at, mm", "apparent max. shear, median", "MAER", "SDER")
+        for tissue in (*_TISSUES, POOLED):
+            of_tissue = [row for row in of_condition if row.tissue == tissue]
+            lengths = [_whole_mm(wavelength_recovered(of_tissue, fraction)) for fraction in (0.9, 0.5)]
+            noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == tissue), (None, None, None))
+            if of_tissue:
+                table_rows.append((*of_condition[0].condition, tissue, *lengths, *noise))
+    columns = (*_CONDITION, "tissue", "90 % at, mm", "50 % at, mm", "apparent max. shear, median", "MAER", "SDER")
     drawings = {"resolution": Drawing.of("Spatial resolution", figures.resolution, rows)}
     if known := figures.noise_and_resolution(floors, rows, POOLED):
         names = ("condition", "wavelength_recovered_to_90_percent_mm", "max_shear_without_load")
@@ -217,5 +253,6 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
         drawing = Drawing.of("Noise against resolution", figures.trade_off, known, POOLED, data=data)
         drawings["noise_and_resolution"] = drawing
     pictures = [drawing.save(folder / stem) for stem, drawing in drawings.items()]
-    table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows), _OF_FLOOR)
+    note = f"{_OF_LENGTHS} {_OF_FLOOR}"
+    table = Table("Spatial resolution and noise by tissue", columns, tuple(table_rows), note)
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import phantoms
-from dvc import engine_named
+from dvc import GaussNewton, GaussNewtonWithInterfaces, engine_named
 from dvc.atomic_files import whole_folder, write_csv, write_json
 from dvc.io.result_folder import FIGURES, PROVENANCE, REPORT
 from dvc.report.page import record_lines, write_report
 from mrstrain.records.provenance import provenance
-from mrstrain.truth.accuracy_page import HOW_TO_READ, motion_of, sections_of
+from mrstrain.truth.accuracy_page import HOW_TO_READ, answers, motion_of, sections_of
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow
 
 _HEELS, _STRAINED = 2, 3  # motions with strain, at least, for an error model
@@ -74,7 +74,7 @@ class AccuracyStudy:
         with whole_folder(out / FIGURES) as folder:
             sections = sections_of(errors, floors, resolution, coverage, failures, folder)
         notes = [f"Incomplete: {len(failures)} of {len(runs) + len(failures)} cases failed."] if failures else []
-        notes += few
+        notes += [*few, *study.without_labels]
         title, lines = "Accuracy of registration engines", record_lines(record)
         write_report(out / REPORT, title, None, sections, [HOW_TO_READ], lines, notes=notes)
         return study
@@ -84,9 +84,22 @@ class AccuracyStudy:
         """Whether no case failed."""
         return not self.failures
 
+    @property
+    def without_labels(self) -> list[str]:
+        """A sentence if the engine that `register` uses with a label map was measured without one alone."""
+        measured = {row.preset for row in (*self.errors, *self.resolution)}
+        with_labels = GaussNewtonWithInterfaces.name
+        if GaussNewton.name not in measured or with_labels in measured:
+            return []
+        return [
+            f"{GaussNewton.name} was measured without a label map. `register --labels` uses {with_labels}; measure "
+            f"its error with `--preset {with_labels}`."
+        ]
+
     def summary(self) -> list[str]:
-        """Summary, a few lines."""
-        lines = [
+        """Summary, a few lines: the answer of the report first."""
+        lines = answers(self.errors, self.floors) + self.without_labels
+        lines += [
             f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {motion_of(r)}, {r.tissue}: max. shear RMSE "
             f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"
             for r in self.errors

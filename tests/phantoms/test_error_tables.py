@@ -137,9 +137,11 @@ def test_floor_and_resolution_come_from_their_own_runs() -> None:
 def test_wavelength_is_read_between_the_rows() -> None:
     rows = resolution_rows([samples(replace(CASE, motion=f"wave-{w}")) for w in (6, 8, 12)])
     rows = [replace(r, recovered=v) for r, v in zip(rows[:3], (0.2, 0.4, 0.8), strict=True)]
-    assert wavelength_recovered(rows, 0.5) == pytest.approx(9.0)
+    assert wavelength_recovered(rows, 0.5) == pytest.approx(8.0 * 1.5**0.25)  # a quarter of the way from 8 to 12 mm
     assert np.isnan(wavelength_recovered(rows, 0.9))
     assert np.isnan(wavelength_recovered(rows, 0.1))
+    with pytest.raises(ValueError, match="several conditions or tissues"):
+        wavelength_recovered([*rows, replace(rows[0], tissue="skin")], 0.5)
 
 
 def test_error_model_finds_the_error_that_was_put_in() -> None:

@@ -342,6 +342,16 @@ def test_without_log_and_deck_a_time_that_is_not_whole_or_a_file_without_its_end
     assert early_end(cut) is None
 
 
+def test_a_binary_calculix_result_is_named_as_such_and_not_as_a_run_that_ended_early(
+    folder: Path, tmp_path: Path
+) -> None:
+    """It has no last line, like the result of a run that failed."""
+    binary = tmp_path / "Load1.frd"
+    binary.write_bytes((folder / "calculix/binary.frd").read_bytes())
+    with pytest.raises(ImageFileError, match=r"Load1\.frd: not a text file\. .*\*NODE FILE in place of \*NODE OUTPUT"):
+        early_end(binary)
+
+
 def test_a_long_log_is_not_read_whole(tmp_path: Path) -> None:
     log = tmp_path / "model.log"
     with log.open("wb") as sparse:

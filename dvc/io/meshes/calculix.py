@@ -38,10 +38,7 @@ def read_frd(path: Path) -> RawMesh:
     try:
         text = path.read_text(encoding="ascii")
     except (UnicodeDecodeError, OSError) as error:
-        raise ImageFileError(
-            f"{path}: not a text file. If it is a binary result of CalculiX, write it with *NODE FILE in place of "
-            "*NODE OUTPUT."
-        ) from error
+        raise _not_text(path) from error
     mesh = NumberedMesh(path)
     materials: dict[str, list[int]] = {}
     at_nodes: dict[str, dict[int, list[float]]] = {}
@@ -61,13 +58,25 @@ def read_frd(path: Path) -> RawMesh:
 
 
 def time_reached(path: Path) -> float | None:
-    """The latest time of a static or transient result in the file; None where it has none."""
+    """The latest time of a static or transient result in the file; None where it has none.
+
+    ImageFileError for a binary file, whose heads alone are text.
+    """
     times = []
     with path.open("rb") as file, damage_named(f"{path}: a head of results"):
         for line in file:
+            if not line.isascii():
+                raise _not_text(path)
             if line.startswith(b"  100C") and int(line[_ANALYSIS]) in _IN_TIME:
                 times.append(finite(float(line[_TIME])))
     return max(times, default=None)
+
+
+def _not_text(path: Path) -> ImageFileError:
+    return ImageFileError(
+        f"{path}: not a text file. If it is a binary result of CalculiX, write it with *NODE FILE in place of "
+        "*NODE OUTPUT."
+    )
 
 
 def is_closed(path: Path) -> bool:

@@ -12,7 +12,16 @@ import pytest
 from dvc.report.page import Section
 from mrstrain.truth.accuracy_page import sections_of
 from mrstrain.truth.accuracy_study import AccuracyStudy
-from phantoms import TISSUES, AccuracyCase, ErrorSamples, coverage_rows, error_rows, floor_rows, resolution_rows
+from phantoms import (
+    TISSUES,
+    AccuracyCase,
+    ErrorSamples,
+    ResolutionRow,
+    coverage_rows,
+    error_rows,
+    floor_rows,
+    resolution_rows,
+)
 from tests.phantoms.test_error_tables import samples
 
 USUAL = AccuracyCase("gauss-newton", (0.8, 0.8, 0.8), 25.0, "smooth", 1)
@@ -55,8 +64,9 @@ def test_the_page_begins_with_the_answer_at_the_usual_condition(tmp_path: Path, 
     """The error is over both motions, sqrt((.03^2 + .04^2) / 2), and the unloaded pair is the noise floor alone."""
     first, *others = sections(runs, tmp_path, {"a case": "a reason"})
     assert first.paragraphs == (
-        "With gauss-newton, voxels of 0.8 mm and SNR 25, the max. shear has an error (RMSE) of 0.035 in fat, 0.035 in "
-        "muscle and 0.035 in skin; the noise floor (median) is 0.010 in fat, 0.010 in muscle and 0.010 in skin.",
+        "With gauss-newton without a label map, voxels of 0.8 mm and SNR 25, the max. shear has an error (RMSE over 2 "
+        "motions, with their range) of 0.035 (0.030 to 0.040) in fat, 0.035 (0.030 to 0.040) in muscle and 0.035 "
+        "(0.030 to 0.040) in skin; the noise floor (median) is 0.010 in fat, 0.010 in muscle and 0.010 in skin.",
     )
     assert not first.folded
     assert first.pictures_first
@@ -85,7 +95,7 @@ def test_a_study_without_strain_or_without_a_noise_floor_says_what_it_knows(tmp_
     error = "the max. shear has an error (RMSE) of 0.030 in fat, 0.030 in muscle and 0.030 in skin."
     for run, says in ((still, floor), (loaded, error)):
         (sentence,) = sections([run], tmp_path)[0].paragraphs
-        assert sentence == f"With gauss-newton, voxels of 0.8 mm and SNR 25, {says}"
+        assert sentence == f"With gauss-newton without a label map, voxels of 0.8 mm and SNR 25, {says}"
     assert sections([still], tmp_path)[0].pictures == ()  # rather than an empty one
 
 
@@ -95,11 +105,48 @@ def test_a_study_of_waves_alone_begins_with_their_resolution(tmp_path: Path) -> 
     assert not only.folded
 
 
+def test_resolution_is_that_of_each_tissue_between_the_wavelengths_of_the_study(tmp_path: Path) -> None:
+    """Waves of all tissues in one list gave the longest one for soft tissue: "90 % at 48 mm"."""
+    condition = ("gauss-newton", "1.2", 15.0)
+    found = {"fat": (0.86, 0.93, 0.98), "skin": (0.6, 0.79, 0.87), "soft tissue": (0.69, 0.896, 0.952)}
+    rows = [
+        ResolutionRow(*condition, tissue, *at)
+        for tissue, of in found.items()
+        for at in zip((12, 24, 48), of, strict=True)
+    ]
+    (only,) = sections_of((), (), rows, (), {}, tmp_path)
+    (table,) = only.tables
+    assert table.columns[3:6] == ("tissue", "90 % at, mm", "50 % at, mm")
+    assert [row[3:6] for row in table.rows] == [("fat", 18, None), ("skin", None, None), ("soft tissue", 25, None)]
+
+
+def test_the_terminal_begins_with_the_answer_of_the_page(tmp_path: Path, runs: list[ErrorSamples]) -> None:
+    """Then the same for other presets at that condition, and how an engine with a label map is measured."""
+    runs.append(in_three_tissues(replace(USUAL, spacing_mm=(1.2, 1.2, 1.2)), 0.2))
+    study = AccuracyStudy.of(tmp_path, runs, {})
+    usual, beside, labels, first, *_ = study.summary()
+    (answer,) = sections(runs, tmp_path)[0].paragraphs
+    assert usual == answer
+    assert beside.startswith(
+        "With heel-mr, voxels of 0.8 mm and SNR 25, the max. shear has an error (RMSE) of 0.100 in"
+    )
+    assert labels == (
+        "gauss-newton was measured without a label map. `register --labels` uses gauss-newton-borders; measure its "
+        "error with `--preset gauss-newton-borders`."
+    )
+    assert first.startswith("heel-mr, 0.8 mm, SNR 25, smooth, fat: max. shear RMSE")
+    page = (tmp_path / "report.html").read_text()
+    assert page.index("measure its error with") < page.index("<img")
+    with_labels = in_three_tissues(replace(USUAL, preset="gauss-newton-borders"), 0.02)
+    for measured in ([*runs, with_labels], runs[:1]):  # it was measured, or only another preset was
+        assert not AccuracyStudy.of(tmp_path, measured, {}).without_labels
+
+
 def test_the_sentence_precedes_the_picture_and_the_picture_every_table(
     tmp_path: Path, runs: list[ErrorSamples]
 ) -> None:
     AccuracyStudy.of(tmp_path, runs, {})
     page = (tmp_path / "report.html").read_text()
-    assert page.index("has an error (RMSE) of") < page.index("<img") < page.index("<table")
+    assert page.index("has an error (RMSE over 2 motions") < page.index("<img") < page.index("<table")
     main = page[page.index("<main>") :]
     assert len(re.findall(r'<details id="part-\d+"[^>]* open>', main)) == 1
