@@ -1,7 +1,9 @@
 """Names of loads, material sets and models, which become names of files: none leads out of the folder of results."""
 
 import os
+import shlex
 import stat
+import subprocess
 import unicodedata
 from collections.abc import Iterable
 
@@ -62,6 +64,16 @@ def is_utf8(path: os.PathLike[str]) -> bool:
     except UnicodeEncodeError:
         return False
     return True
+
+
+def as_typed(path: str | os.PathLike[str]) -> str:
+    """A path, or another value, as it is typed in a command: in quotation marks where a shell would misread it.
+
+    >>> as_typed("results/Load1")
+    'results/Load1'
+    """
+    text = os.fspath(path)
+    return subprocess.list2cmdline([text]) if os.name == "nt" else shlex.quote(text)
 
 
 def one_spelling(name: str) -> str:

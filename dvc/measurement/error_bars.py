@@ -11,6 +11,7 @@ import numpy as np
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
+from dvc.file_names import as_typed
 from dvc.images.depth import to_surface_mm
 from dvc.images.image import Grid, Mask
 from dvc.measurement.subject import Subject, is_bones_name
@@ -249,7 +250,7 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     used = found.settings.engine
     if used.without_error_model:
         raise InputError(used.without_error_model)
-    measure = f"`mrstrain accuracy --preset {used.name}`"
+    measure = f"`mrstrain accuracy --preset {as_typed(used.name)}`"
     if given is None:
         raise InputError(f"The error of {used.name} has not been measured. Measure it with {measure}.")
     if given.preset != used.name:

@@ -19,6 +19,7 @@ import numpy as np
 from dvc.arrays import Float32Array, FloatArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
+from dvc.file_names import as_typed
 from dvc.own_files import read_json
 from dvc.trust.quality import plain
 
@@ -145,7 +146,7 @@ class ErrorModel:
             raise InputError(
                 f"The error of {self.preset} is not known for voxels of {_told(spacing_mm)} mm at SNR {snr:.0f}: the "
                 f"closest known, {_told(nearest.spacing_mm)} mm at SNR {nearest.snr:.0f}, is too far. Measure it with "
-                f"`mrstrain accuracy --preset {self.preset}` (--spacing, --snr); give its file as "
+                f"`mrstrain accuracy --preset {as_typed(self.preset)}` (--spacing, --snr); give its file as "
                 "error_model (--error-model)."
             )
         return nearest

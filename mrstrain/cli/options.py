@@ -5,7 +5,7 @@ import inspect
 import operator
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import UnionType
@@ -64,6 +64,10 @@ EXAMPLES = {
 _TYPED = "mrstrain.typed"  # where a context of click keeps the command line
 _HAS_STUDY_LOG = "demo"
 _EMPTY = re.compile(r"--[a-z-]+=")
+_NUMBER = re.compile(r"\s*[-+]?[0-9.]+\s*")
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
+_NO_NUMBER = {"float_parsing": "a number", "int_parsing": "a whole number"}  # of pydantic's errors
+_IN_WORDS = {2: "two", 3: "three"}
 _ONE_FILE = ("label", "mesh")  # commands that write a file, and others beside it
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
 
@@ -121,13 +125,32 @@ class Grouped(TyperCommand):
                 of = one.removesuffix("=") or before
                 what = f"The value of {of}" if of.startswith("-") else "An argument"
                 ctx.fail(f"{what} is empty. If you gave a shell variable, it may not be set.")
+        typed = tuple(args)  # parsing takes them out
         try:
             return super().parse_args(ctx, args)
-        except Exception as missing:
-            if type(missing).__name__ == "MissingParameter":  # of click, or of the copy that typer has
-                told: Any = missing
-                told.message = told.param.help
+        except Exception as error:
+            wrong: Any = error
+            if told := self._explained(wrong, typed):
+                wrong.message = told
             raise
+
+    def _explained(self, wrong: Any, typed: Sequence[str]) -> str:
+        """What to say of an error of parsing; empty where what it says will do."""
+        kind = type(wrong).__name__  # of click, or of the copy that typer has
+        if kind == "MissingParameter":
+            return str(wrong.param.help)
+        if kind == "BadOptionUsage":  # too few values
+            of = next((one for one in self.params if wrong.option_name in one.opts), None)
+            value = "".join(re.findall(rf"(?:^|\0){wrong.option_name}[=\0]([^\0]*)", "\0".join(typed))[-1:])
+            return "" if of is None else _in_a_row(wrong.option_name, value, of.nargs)
+        refused = getattr(wrong.__cause__, "errors", list)()
+        if kind != "BadParameter" or not refused or refused[0]["type"] not in _NO_NUMBER:
+            return ""
+        value = str(refused[0]["input"])
+        if _DECIMAL_COMMA.fullmatch(value):
+            return f"'{value}' is not a number. Use a decimal point, not a comma: {value.replace(',', '.')}."
+        told = _in_a_row(wrong.param.opts[0], value, wrong.param.nargs)
+        return told or f"'{value}' is not {_NO_NUMBER[refused[0]['type']]}."
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The words after the command, arguments without the braces that typer puts around them."""
@@ -145,6 +168,14 @@ class Grouped(TyperCommand):
         for name in sorted(groups, key=_GROUPS.index):
             with formatter.section(name):
                 formatter.write_dl(groups[name])
+
+
+def _in_a_row(option: str, value: str, wanted: int) -> str:
+    """How to type the numbers of an option that were typed with commas; empty for any other value."""
+    numbers = value.split(",")
+    if wanted not in _IN_WORDS or len(numbers) != wanted or not all(map(_NUMBER.fullmatch, numbers)):
+        return ""
+    return f"'{value}' is one value. Type {_IN_WORDS[wanted]} numbers with spaces: {option} {' '.join(numbers)}."
 
 
 def _plainly(name: str) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
 from dvc.errors import MrstrainError
+from dvc.file_names import as_typed
 from dvc.io.images.labels import read_names
 from dvc.io.result_folder import REPEAT
 from dvc.labelling.boundaries import correctable
@@ -102,7 +103,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
             lines, warnings = costs(told, planned, left, *sizes_of(told), in_parallel(workers))
             looked.notes += lines
             looked.warnings += warnings
-            next_step = f"mrstrain run {study}"
+            next_step = f"mrstrain run {as_typed(study)}"
         else:
             looked.notes.append("All stages are up to date; a run only rewrites the report.")
     return Checked(tuple(looked.wrong), tuple(looked.warnings), tuple(looked.notes), next_step)
@@ -258,8 +259,7 @@ class _Look:
         subject, how = self.study.subject_files, self.study.registration.located(self.study.place)
         if subject.bone_label is not None and labels is not None:
             self.tried_at("images", "bone", labels.region, subject.bone_label)
-        engine = self.tried(engine_of, how, labelled=True)
-        if engine is None:
+        if (engine := self.tried(engine_of, how, labelled=True)) is None:
             return
         own = how.error_model
         model = error_model_of(engine.name) if own is None else self.tried(read_error_model, own)
@@ -270,7 +270,7 @@ class _Look:
         elif model.preset != engine.name:
             self.notes.append(
                 f"The error model was made for {model.preset}, but {engine.name} will be used, so results will have no "
-                f"intervals; `mrstrain accuracy --preset {engine.name}` makes one for it."
+                f"intervals; `mrstrain accuracy --preset {as_typed(engine.name)}` makes one for it."
             )
 
     def at_meshing(self, labels: LabelMap) -> None:

@@ -11,6 +11,7 @@ import jinja2
 from dvc import read_image, read_labels
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, OutputError
+from dvc.file_names import as_typed
 from dvc.io.images.dicom import is_dicom, is_multiframe
 from dvc.measurement.subject import is_bones_name
 from fe import BONE, published_names
@@ -102,13 +103,14 @@ class NewStudy:
         seen = (
             "Check the picture of the images found" if isinstance(self.picture, Path) else "Picture of the images found"
         )
-        return [*lines, f"{seen}: {self.picture}", f"Next step: mrstrain check {self.path.parent}"]
+        return [*lines, f"{seen}: {self.picture}", f"Next step: mrstrain check {as_typed(self.path.parent)}"]
 
     def _without_labels(self) -> list[str]:
         """How to go on where the study has neither a label map nor a mask of the bone."""
         place = self.path.parent
-        load0, *loads = (place / name for name in (self.inputs.load0 or "Load0.nii.gz", *self.inputs.loads.values()))
-        measured = f"mrstrain register {load0} {' '.join(map(str, loads))} --bone BONE.nii.gz --out {place / 'results'}"
+        names = self.inputs.load0 or "Load0.nii.gz", *self.inputs.loads.values()
+        images = " ".join(as_typed(place / name) for name in names)
+        measured = f"mrstrain register {images} --bone BONE.nii.gz --out {as_typed(place / 'results')}"
         return [
             'Without a label map, paint a mask of the bone: with bone_mask and labels = "auto", the study makes the '
             "label map from the image.",

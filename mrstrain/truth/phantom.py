@@ -11,6 +11,7 @@ from dvc import Grid, Image, LabelMap, Mask, RigidMotion, StrainMaps, strain_map
 from dvc.atomic_files import whole_folder, write_json
 from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
+from dvc.file_names import as_typed
 from dvc.io.result_folder import PROVENANCE, REGIONS, write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.options.door import door
@@ -43,12 +44,13 @@ class PhantomFiles:
     def summary(self) -> list[str]:
         """Summary, with the command that registers the images."""
         at = self.out
-        loads = " ".join(str(path) for name, path in self.images.items() if name in LOADS)
+        loads = " ".join(as_typed(path) for name, path in self.images.items() if name in LOADS)
         return [
             f"Images: {', '.join(path.name for path in self.images.values())}; truth: {at / TRUTH}",
-            f"To register them: mrstrain register {self.images['Load0']} {loads} --bone {at / 'calcaneus.nii.gz'} "
-            f"--labels {at / 'tissues.nii.gz'} --names {at / 'tissues.csv'} "
-            f"--repeat {self.images[_AGAIN]} --out {at / 'results'}",
+            f"To register them: mrstrain register {as_typed(self.images['Load0'])} {loads} "
+            f"--bone {as_typed(at / 'calcaneus.nii.gz')} --labels {as_typed(at / 'tissues.nii.gz')} "
+            f"--names {as_typed(at / 'tissues.csv')} --repeat {as_typed(self.images[_AGAIN])} "
+            f"--out {as_typed(at / 'results')}",
         ]
 
 

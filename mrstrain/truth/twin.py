@@ -5,6 +5,7 @@ from pathlib import Path
 
 from dvc import Measurement, write_image
 from dvc.atomic_files import write_json
+from dvc.file_names import as_typed
 from dvc.io.result_folder import PROVENANCE
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
@@ -58,11 +59,14 @@ def twin(
         (target / _TRUTH).parent.mkdir(exist_ok=True)
         measured.write(target / _TRUTH, record)
         write_json(target / PROVENANCE, record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
-    told = " ".join(f"{subject_files.option(name)} {value}" for name, value in subject_files if value is not None)
+    told = " ".join(
+        f"{subject_files.option(name)} {as_typed(value)}" for name, value in subject_files if value is not None
+    )
     align = " --align none" if subject.bone is None else ""
     lines = (
         f"Warped image: {target / _IMAGE}; it shows {100 * made.shown:.0f} % of the tissue. Truth: {target / _TRUTH}",
         f"True {measured.strain_line}",
-        f"To register it: mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}",
+        f"To register it: mrstrain register {as_typed(load0)} {as_typed(target / _IMAGE)} {told}{align} "
+        f"--out {as_typed(target / 'results')}",
     )
     return Outcome(target, lines)

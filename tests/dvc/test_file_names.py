@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 import dvc
 import fe
 from dvc.errors import InputError
-from dvc.file_names import as_file_name, clash
+from dvc.file_names import as_file_name, as_typed, clash
 from mrstrain import register
 from mrstrain.comparison.model_files import model_files
 from mrstrain.models.simulate import material_sets
@@ -35,6 +36,17 @@ def test_it_is_refused_wherever_it_is_given(tmp_path: Path, name: str) -> None:
     (tmp_path / "mine.toml").write_text(fe.as_toml(name, "", {"fat": fe.NeoHooke.of(mu_mpa=0.01, nu=0.49)}))
     with pytest.raises(InputError, match=r"mine\.toml: The name of the material set"):
         fe.read_material_sets(tmp_path / "mine.toml")
+
+
+@pytest.mark.parametrize("path", ["new heel/Load0.nii.gz", "it's/$HOME", "a;b", "plain/Load0.nii.gz", ""])
+def test_a_shell_reads_a_path_as_one_word(monkeypatch, path: str) -> None:
+    typed = dict[str, str]()
+    for system in ("posix", "nt"):
+        with monkeypatch.context() as there:
+            there.setattr(os, "name", system)
+            typed[system] = as_typed(path)
+    assert shlex.split(typed["posix"]) == [path]
+    assert typed["nt"] == (f'"{path}"' if " " in path or not path else path)
 
 
 @pytest.mark.parametrize("name", ["Load1", "Load 1, repeat", "Füße", "kräftig=140", "console", "com", "a.b", "a" * 200])

@@ -164,17 +164,20 @@ def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], hee
     motion, foot = under_load(heel, "Load4"), random_foot_motion(2, 1)
     u = sampled(image.grid, Composed([motion, foot]))
     write_vectors(tmp_path / "u.nii.gz", image.grid, u.astype(np.float32), ("x", "y", "z"), "u", "LPS", unit="mm")
-    given = ["twin", str(tmp_path / "Load0.nii.gz"), str(tmp_path / "u.nii.gz"), "--out", str(tmp_path / "out")]
+    given = ["twin", str(tmp_path / "Load0.nii.gz"), str(tmp_path / "u.nii.gz"), "--out", str(tmp_path / "warped heel")]
     result = CliRunner().invoke(app, [*given, "--bone", str(tmp_path / "bone.nii.gz")])
     assert result.exit_code == 0, result.output
-    assert "mrstrain register" in result.output
-    assert read_image(tmp_path / "out" / "twin.nii.gz").grid.same_as(image.grid)
-    found = read_image(tmp_path / "out" / "truth" / "twin" / "max_shear.nii.gz", allow_missing=True).values
+    registered = (
+        f"'{tmp_path}/warped heel/twin.nii.gz' --bone {tmp_path}/bone.nii.gz --out '{tmp_path}/warped heel/results'"
+    )
+    assert f"mrstrain register {tmp_path}/Load0.nii.gz {registered}" in " ".join(result.output.split())
+    assert read_image(tmp_path / "warped heel" / "twin.nii.gz").grid.same_as(image.grid)
+    found = read_image(tmp_path / "warped heel" / "truth" / "twin" / "max_shear.nii.gz", allow_missing=True).values
     fat = labels_of(heel, image.grid).region("fat").inside & np.isfinite(found)
     true = StrainField.from_gradient(motion.evaluate(image.grid.points(fat))[1]).max_shear
     # a displacement sampled every 1.6 mm blurs the jumps of the strain
     assert np.median(np.abs(found[fat] - true)) < 0.01
-    assert (tmp_path / "out" / "truth" / "twin" / "displacement.nii.gz").exists()
+    assert (tmp_path / "warped heel" / "truth" / "twin" / "displacement.nii.gz").exists()
 
 
 def test_where_the_unloaded_image_did_not_look_the_twin_has_no_value(unloaded: tuple[Image, Mask]) -> None:

@@ -69,6 +69,26 @@ def test_an_empty_value_is_refused(given: list[str], told: str) -> None:
     assert f"{told} If you gave a shell variable, it may not be set." in ran.output
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("--bending 3,5", "'3,5' is not a number. Use a decimal point, not a comma: 3.5."),
+        ("--bending 3mm", "'3mm' is not a number."),
+        ("--threads two", "'two' is not a whole number."),
+        ("--plate-normal 0,0,-1", "Type three numbers with spaces: --plate-normal 0 0 -1."),
+        ("--plate-normal=0,0,-1", "Type three numbers with spaces: --plate-normal 0 0 -1."),
+        ("--plate-normal 0,0,-1 --align none", "Type three numbers with spaces: --plate-normal 0 0 -1."),
+        ("--plate-normal 0 0 -1,5", "'-1,5' is not a number. Use a decimal point, not a comma: -1.5."),
+        ("--plate-normal 0 1", "Option '--plate-normal' requires 3 arguments."),
+        ("--align bones", "'bones'"),
+    ],
+)
+def test_a_number_that_is_none_is_quoted_with_the_form_that_is_expected(given: str, told: str) -> None:
+    ran = CliRunner().invoke(app, ["register", "Load0.nii.gz", "Load1.nii.gz", "--out", "out", *given.split()])
+    assert ran.exit_code == 2
+    assert told in " ".join(ran.output.split())
+
+
 @pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"doctor"}))  # which takes nothing
 def test_each_help_ends_with_an_example_that_can_be_pasted(name: str) -> None:
     program, command, *given = HELP[name].splitlines()[-1].split()

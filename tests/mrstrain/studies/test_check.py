@@ -62,6 +62,12 @@ def test_the_command_ends_with_status_2_where_something_is_wrong_and_0_where_not
     assert "ERROR" in ill.output
 
 
+def test_the_next_step_takes_a_folder_with_a_space(study):
+    (study / "study.toml").write_text(STUDY.replace('"mine.toml", ', ""))
+    spaced = study.rename(study.parent / "study one")
+    assert check(spaced).summary()[-1] == f"No problems found. Next step: mrstrain run '{spaced}'"
+
+
 def test_details_that_nobody_must_give_are_one_note_and_no_problem(study):
     def told(more: str) -> list[str]:
         (study / "study.toml").write_text(STUDY.replace('"mine.toml", ', "") + more)

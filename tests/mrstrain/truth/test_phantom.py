@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.read import read_image
 from mrstrain import phantom as make
 from mrstrain.cli.app import app
+from mrstrain.truth.phantom import PhantomFiles
 from phantoms import Heel, random_foot_motion, under_load
 
 
@@ -39,6 +41,15 @@ def test_truth_lies_beside_the_images_as_register_writes_it(made: Path) -> None:
     assert not (made / "truth" / "Load2").exists()
     images = {"Load0", "Load0-again", "Load1", "Load4", "calcaneus", "tissues", "tissues_to_mesh"}
     assert images <= {p.name.removesuffix(".nii.gz") for p in made.glob("*.nii.gz")}
+
+
+def test_the_command_that_registers_takes_a_folder_with_a_space() -> None:
+    out = Path("new heel")
+    images = {name: out / f"{name}.nii.gz" for name in ("Load0", "Load0-again", "Load1")}
+    command = PhantomFiles(out, images).summary()[1].removeprefix("To register them: ")
+    typed = "register {0}/Load0.nii.gz {0}/Load1.nii.gz --bone {0}/calcaneus.nii.gz --labels {0}/tissues.nii.gz"
+    typed += " --names {0}/tissues.csv --repeat {0}/Load0-again.nii.gz --out {0}/results"
+    assert shlex.split(command) == ["mrstrain", *(word.format(out) for word in typed.split())]
 
 
 def test_truth_is_that_of_the_motion(made: Path) -> None:
