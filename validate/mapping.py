@@ -181,9 +181,9 @@ def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.n
     for value, name in labels.names.items():
         tissue[number == value] = name
     for region, cells in mesh.regions.items():
-        name = region if region in names else in_any_case.get(region.casefold())
-        if by_mesh and name is not None:
-            tissue[cells] = name
+        label = region if region in names else in_any_case.get(region.casefold())
+        if by_mesh and label is not None:
+            tissue[cells] = label
     return tissue
 
 

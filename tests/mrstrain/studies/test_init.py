@@ -85,15 +85,12 @@ def test_without_a_label_map_it_says_how_to_measure_all_the_same(tmp_path):
     assert not any("Without a label map" in line for line in NewStudy(tmp_path / "study.toml", LABELLED, "").summary())
 
 
-<<<<<<< HEAD
 def test_bones_are_left_open_until_a_label_map_is_there(tmp_path):
     """A label map that is made from the image may hold other bones, which a list written beforehand would leave out."""
     place = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz")).path
     assert [line for line in place.read_text().splitlines() if "bones = " in line and not line.startswith("#")] == []
 
 
-@pytest.mark.parametrize("bone", ["calcaneus", "tibia", "left femur", "bone-mask", "calc", "calc_mask"])
-=======
 def test_commands_to_type_take_a_folder_with_a_space(tmp_path):
     folder = tmp_path / "study one"
     folder.mkdir()
@@ -103,8 +100,7 @@ def test_commands_to_type_take_a_folder_with_a_space(tmp_path):
     assert told[-1] == f"Next step: mrstrain check '{folder}'"
 
 
-@pytest.mark.parametrize("bone", ["calcaneus", "tibia", "left femur", "bone-mask"])
->>>>>>> c29
+@pytest.mark.parametrize("bone", ["calcaneus", "tibia", "left femur", "bone-mask", "calc", "calc_mask"])
 def test_with_a_mask_of_the_bone_the_study_makes_its_label_map(tmp_path, bone):
     made = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", f"{bone}.nii.gz"))
     told = made.summary()
