@@ -246,7 +246,7 @@ def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
     hint = (
         f"It would fit with {' and '.join(fitting[0])}; check the unit and frame of the model"
         if fitting
-        else "Give the rigid map to the frame of the image (to_image)"
+        else "Give the rigid map to the frame of the image: to_image (--to-image)"
     )
     raise GeometryError(
         f"{path} does not lie in the image. Model: {box_told(*mesh.bounds_mm)}; image: {box_told(*grid.bounds_mm())} "

@@ -115,9 +115,10 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
         there = labels.grid.points(labelled)
         own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
-            f"{path}: only {100 * overlap:.0f} % of the model lies in the labelled soft tissue. Model: {own}; tissue: "
-            f"{of_tissue} (LPS mm). Check that both are of one subject, and the model's unit and frame; or give the "
-            "rigid map to the image (to_image)."
+            f"{path}: only {100 * overlap:.0f} % of the model lies in the labelled soft tissue "
+            f"({100 * _LEAST_OVERLAP:.0f} % is needed). Model: {own}; tissue: {of_tissue} (LPS mm). Check that both "
+            "are of one subject, and the model's unit and frame (--model-unit mm or m, --model-frame LPS or RAS); or "
+            "give the rigid map to the image: to_image (--to-image)."
         )
     return overlap
 
@@ -139,7 +140,10 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str], bone: cKDT
         )
     overlap = check_in_tissue(result.path, mesh, labels, bones)
     if overlap < _GOOD_OVERLAP:
-        warnings.append(f"only {100 * overlap:.0f} % of the model lies in the labelled soft tissue; check its frame.")
+        warnings.append(
+            f"only {100 * overlap:.0f} % of the model lies in the labelled soft tissue; check its frame "
+            "(--model-frame LPS or RAS)."
+        )
     names = [name for name in labels.names.values() if name not in bones]
     tissue, of_mesh = (tissues_of(mesh, labels, by_mesh=by_mesh) for by_mesh in (False, True))
     both, volume = np.isin(tissue, names) & np.isin(of_mesh, names), mesh.volumes_mm3

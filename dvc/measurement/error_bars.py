@@ -184,7 +184,7 @@ def error_bars(
         "to tissue that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
     )
     told = " ".join((told, *gaps))
-    used, beyond = _used(chosen, table, wider), table.beyond(larger, snr)
+    used, beyond = _used(chosen, table, wider), table.beyond(larger, snr, chosen.preset)
     return ErrorBars(sure, told, used, rows, _of_twin(rows, twin), beyond)
 
 

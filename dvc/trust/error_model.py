@@ -87,13 +87,17 @@ class ErrorTable:
         voxel = np.abs(np.log(np.sort(spacing_mm) / np.sort(self.spacing_mm))).max()
         return float(np.exp(max(voxel, abs(np.log(snr / self.snr)))))
 
-    def beyond(self, spacing_mm: FloatArray, snr: float) -> str:
-        """A sentence if voxels (3,) mm or SNR of images differ from its own by more than a factor of 1.2."""
+    def beyond(self, spacing_mm: FloatArray, snr: float, preset: str) -> str:
+        """Two sentences if voxels (3,) mm or SNR of images differ from its own by more than a factor of 1.2.
+
+        The second says how the errors of the ``preset`` are measured for these images.
+        """
         if self.far(spacing_mm, snr) <= _BEYOND:
             return ""
         return (
             f"The error bars were measured on phantoms (voxels of {_told(self.spacing_mm)} mm, SNR {self.snr:.0f}); "
-            f"these images have {_told(spacing_mm)} mm and SNR {snr:.0f}, so they may cover more or less than 95 %."
+            f"these images have {_told(spacing_mm)} mm and SNR {snr:.0f}, so they may cover more or less than 95 %. "
+            f"Measure {_measuring('yours', preset, spacing_mm, snr)}"
         )
 
     def expected(
@@ -145,9 +149,8 @@ class ErrorModel:
         if not nearest.far(spacing_mm, snr) <= _FAR:
             raise InputError(
                 f"The error of {self.preset} is not known for voxels of {_told(spacing_mm)} mm at SNR {snr:.0f}: the "
-                f"closest known, {_told(nearest.spacing_mm)} mm at SNR {nearest.snr:.0f}, is too far. Measure it with "
-                f"`mrstrain accuracy --preset {as_typed(self.preset)}` (--spacing, --snr); give its file as "
-                "error_model (--error-model)."
+                f"closest known, {_told(nearest.spacing_mm)} mm at SNR {nearest.snr:.0f}, is too far. Measure "
+                f"{_measuring('it', self.preset, spacing_mm, snr)}"
             )
         return nearest
 
@@ -232,6 +235,15 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
         if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
             raise ValueError("a voxel size, SNR or bin is not positive, or the bins do not increase")
     return ErrorModel(str(told["preset"]), str(told["parameters_sha256"]), tables, str(told["source"]))
+
+
+def _measuring(what: str, preset: str, spacing_mm: FloatArray, snr: float) -> str:
+    """How an error model is made for voxels (3,) mm and an SNR, as the end of a sentence."""
+    short, plane, long = np.sort(spacing_mm)  # two edges or more are alike
+    across = max(short, long, key=lambda edge: abs(np.log(edge / plane)))
+    slices = f" --slice-spacing {across:.2g}" if abs(np.log(across / plane)) > 0.01 else ""
+    command = f"mrstrain accuracy --preset {as_typed(preset)} --spacing {plane:.2g}{slices} --snr {snr:.0f} --out DIR"
+    return f"{what} with `{command}`; give its file as --error-model."
 
 
 def _told(spacing_mm: FloatArray) -> str:

@@ -192,8 +192,8 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     hints = get_type_hints(command, include_extras=True)
 
     @functools.wraps(command)
-    def flat(**given: Any) -> None:
-        made = {name: _made(model, given) for name, model in models.items()}
+    def flat(context: typer.Context, **given: Any) -> None:
+        made = {name: _made(model, given, context) for name, model in models.items()}
         command(**given, **made)
 
     own = [
@@ -202,8 +202,10 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
         if name not in models
     ]
     offered = [_offered(model, field, info) for model in models.values() for field, info in model.model_fields.items()]
-    flat.__signature__ = inspect.Signature([*own, *offered])  # type: ignore[attr-defined]
-    flat.__annotations__ = {one.name: one.annotation for one in (*own, *offered)} | {"return": None}
+    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+    parameters = (context, *own, *offered)
+    flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    flat.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": None}
     return flat
 
 
@@ -245,11 +247,12 @@ def _plain(annotation: Any, metadata: list[Any]) -> Any:
     return list[get_args(kind)[0]] if ... in get_args(kind) else kind  # type: ignore[misc]
 
 
-def _made(model: type[Options], given: dict[str, Any]) -> Options:
-    """The model of what the command line gave, whose fields are taken out of it."""
+def _made(model: type[Options], given: dict[str, Any], context: typer.Context) -> Options:
+    """The model of what the command line gave, whose fields are taken out of it; only what was typed counts as set."""
     chosen: dict[str, Any] = {}
     for field in model.model_fields:
         value, cli = given.pop(field), model.cli(field)
-        if value is not None:
+        source = context.get_parameter_source(field)
+        if value is not None and (source is None or source.name != "DEFAULT"):
             chosen[field] = not value if cli.off else value * cli.times if cli.times != 1.0 else value
     return model.of(chosen, model.option)

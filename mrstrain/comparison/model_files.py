@@ -149,6 +149,12 @@ def model_files(
         taken.append(name)
         notes += _passed_over(name, chosen)
         reading = _reading(place, usual, to_image)
+        notes += [
+            f"{name}: its {SETTINGS} says {what} {own}, which is used instead of {given} ({usual.option(option)})."
+            for what, option in (("unit", "model_unit"), ("frame", "model_frame"))
+            if option in usual.model_fields_set
+            and (own := getattr(reading[0], option)) != (given := getattr(usual, option))
+        ]
         for load in loads:
             if load not in chosen:
                 notes.append(f"{name} has no result for {load}.")

@@ -89,8 +89,14 @@ def read_matrix(path: Path) -> FloatArray:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty file is refused below
             rows = np.loadtxt(path, encoding="utf-8-sig")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a matrix of four rows of four numbers ({error}).") from error
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file. Check the path.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
+    except ValueError as error:
+        raise InputError(
+            f"{path}: not a matrix of four rows of four numbers, separated by spaces, with decimal points."
+        ) from error
     return matrix_of(rows, str(path))
 
 

@@ -164,3 +164,13 @@ def test_settings_for_other_programs_do_not_stop_a_command(tmp_path: Path) -> No
     )  # fmt: skip
     assert (ran.returncode, ran.stderr) == (0, "")
     assert (tmp_path / "a" / "fit.png").exists()
+
+
+def test_only_what_was_typed_counts_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[set[str]]()
+    monkeypatch.setattr(
+        "mrstrain.cli.models.carry_out", lambda *_, reading, **__: seen.append(reading.model_fields_set)
+    )
+    for typed in ([], ["--model-unit", "mm"]):
+        assert CliRunner().invoke(app, ["compare", "dvc", "model", "--out", "out", *typed]).exit_code == 0
+    assert seen == [set(), {"model_unit"}]

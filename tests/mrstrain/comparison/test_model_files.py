@@ -70,3 +70,26 @@ def test_a_model_names_the_parts_that_are_no_tissue(tmp_path: Path) -> None:
     (place / "model.toml").write_text('leave_out = "plate"\n')
     with pytest.raises(InputError, match=r"model\.toml: leave_out is a list of names of regions"):
         regions()
+
+
+def test_settings_of_a_model_that_differ_from_an_option_are_told(tmp_path: Path) -> None:
+    """Where nothing was given, they are the usual way to say it, and no word is needed."""
+    place = model(tmp_path / "mine", Load1="febio/hex8")
+    (place / "model.toml").write_text('unit = "m"\nframe = "LPS"\n')
+    given: ModelReading
+    told: list[str]
+    for given, told in (
+        (ModelReading(), []),
+        (ModelReading(model_unit="m", model_frame="LPS"), []),
+        (
+            ModelReading(model_unit="mm"),
+            ["mine: its model.toml says unit m, which is used instead of mm (--model-unit)."],
+        ),
+        (
+            ModelReading(model_frame="RAS"),
+            ["mine: its model.toml says frame LPS, which is used instead of RAS (--model-frame)."],
+        ),
+    ):
+        files, notes = model_files(["Load1"], [place], given)
+        assert notes == told
+        assert files["Load1"][0].reading.model_unit == "m"

@@ -152,8 +152,25 @@ def test_images_that_are_far_from_those_of_the_error_model_are_told_of_with_the_
         own, snr_found = f"{0.8 * voxel:.2g}", round(min(one.snr for one in found.noise))
         assert bars.beyond == (
             f"The error bars were measured on phantoms (voxels of {own} mm, SNR {snr:.0f}); these images have 0.8 mm "
-            f"and SNR {snr_found}, so they may cover more or less than 95 %."
+            f"and SNR {snr_found}, so they may cover more or less than 95 %. Measure yours with `mrstrain accuracy "
+            f"--preset heel-mr --spacing 0.8 --snr {snr_found} --out DIR`; give its file as --error-model."
         )
+        assert len(bars.beyond) <= 3 * 100
+
+
+@pytest.mark.parametrize(
+    ("voxel", "option"),
+    [
+        ((1.2, 1.2, 1.2), "--spacing 1.2 --snr 14"),
+        ((1.0, 1.0, 3.0), "--spacing 1 --slice-spacing 3 --snr 14"),
+        ((0.5, 1.2, 1.2), "--spacing 1.2 --slice-spacing 0.5 --snr 14"),
+    ],
+)
+def test_the_way_to_error_bars_for_the_images_is_named_in_full(voxel: tuple[float, float, float], option: str) -> None:
+    (table, *_) = model().tables
+    told = table.beyond(np.array(voxel), 14.2, "gauss-newton-borders")
+    assert f"`mrstrain accuracy --preset gauss-newton-borders {option} --out DIR`" in told
+    assert len(told) <= 315  # three lines of a terminal, or a few words more
 
 
 def test_the_noisier_image_counts() -> None:

@@ -92,6 +92,7 @@ def test_without_a_bone_three_lines_tell_how_to_get_one(tmp_path: Path) -> None:
         ("", "shape"),
         ("1 0 nan 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n", "row 1, column 3 of the matrix is not finite"),
         ("1 0 0 1_0\n0 1 0 6\n0 0 1 7\n0 0 0 1\n", "not a matrix of four rows"),
+        ("1,0,0,5\n0,1,0,6\n0,0,1,7\n0,0,0,1\n", "four numbers, separated by spaces, with decimal points\\.$"),
         ("1 0 0 5\n0 1 0 6\n0 0 1 7\n", "4 x 4 is needed"),
     ],
 )
@@ -99,6 +100,8 @@ def test_a_damaged_matrix_is_refused_and_warns_of_nothing(tmp_path: Path, text: 
     (tmp_path / "m.txt").write_text(text)
     with pytest.raises(InputError, match=rf"m\.txt: .*{message}"):
         read_matrix(tmp_path / "m.txt")
+    with pytest.raises(InputError, match=r"^[^()]*n\.txt: no such file\. Check the path\.$"):
+        read_matrix(tmp_path / "n.txt")
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,16 @@ def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
     assert 0.5 * ours < coarser < 0.7 * ours  # 15.5 s instead of 30 s of processor time
 
 
+def test_the_tutorial_tells_the_time_that_the_command_tells() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "tutorials" / "preset.md").read_text()
+    (told,) = re.findall(
+        r"about (\d+) s with\ngauss-newton, (\d+) s with gauss-newton-borders and (\d+) s with elastix", page
+    )
+    case = replace(CASE, spacing_mm=(1.0, 1.0, 1.0))
+    for seconds, preset in zip(map(float, told), ("gauss-newton", "gauss-newton-borders", "heel-mr"), strict=True):
+        assert 60.0 * expected_minutes([replace(case, preset=preset)], 1) == pytest.approx(seconds, rel=0.1)
+
+
 @pytest.mark.parametrize(("preset", "share"), [("gauss-newton", 0.53), ("heel-mr", 0.21)])
 def test_progress_begins_before_the_pair_is_made_and_counts_what_comes_before_the_registration(
     preset: str, share: float, monkeypatch: pytest.MonkeyPatch
