@@ -6,6 +6,7 @@ import stat
 import subprocess
 import unicodedata
 from collections.abc import Iterable
+from contextlib import suppress
 
 from dvc.errors import InputError
 
@@ -55,6 +56,15 @@ def refuse_path(path: str | os.PathLike[str]) -> None:
         return
     if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
         raise InputError(f"{text}: a pipe or device. Give a regular file or a folder.")
+
+
+def refuse_missing(path: str | os.PathLike[str]) -> None:
+    """InputError for a path at which there is nothing; one that cannot be looked at is left to who reads it."""
+    with suppress(PermissionError):
+        try:
+            os.stat(path)
+        except (FileNotFoundError, NotADirectoryError):
+            raise InputError(f"{os.fspath(path)}: no such file or folder. Check the path.") from None
 
 
 def is_utf8(path: os.PathLike[str]) -> bool:

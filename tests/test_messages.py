@@ -190,7 +190,10 @@ def test_an_error_is_printed_in_lines_broken_between_words(
     assert [line.startswith("  ") for line in lines[-2:]] == [True, True]
 
 
-def test_results_are_printed_in_lines_broken_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_printed_in_lines_broken_between_words(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.nii", "b.nii"):
+        Path(name).touch()
     report = "Report: /data/" + "a-long-name/" * 12 + "report.html"
     told = ["Load1: Use with care. " + "The bone moves 0.3 mm. " * 10, "  below it: " + "of them " * 20, report]
 

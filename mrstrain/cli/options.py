@@ -5,7 +5,7 @@ import inspect
 import operator
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import UnionType
@@ -15,6 +15,7 @@ import typer
 from pydantic.fields import FieldInfo
 from typer.core import TyperCommand
 
+from dvc.file_names import refuse_missing
 from mrstrain.cli.lines import say
 from mrstrain.options.door import models_of
 from mrstrain.options.measurement import Frame
@@ -68,6 +69,7 @@ _NUMBER = re.compile(r"\s*[-+]?[0-9.]+\s*")
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
 _NO_NUMBER = {"float_parsing": "a number", "int_parsing": "a whole number"}  # of pydantic's errors
 _IN_WORDS = {2: "two", 3: "three"}
+_WRITTEN = ("out", "draw")  # options with paths of what is written, not read
 _ONE_FILE = ("label", "mesh")  # commands that write a file, and others beside it
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
 
@@ -194,6 +196,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def flat(context: typer.Context, **given: Any) -> None:
         made = {name: _made(model, given, context) for name, model in models.items()}
+        _refuse_missing(given, made.values())
         command(**given, **made)
 
     own = [
@@ -207,6 +210,16 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": None}
     return flat
+
+
+def _refuse_missing(given: Mapping[str, Any], made: Iterable[Options]) -> None:
+    """InputError for a file to read that is not there, before what takes long is imported or started."""
+    for name, value in given.items():
+        for path in value if isinstance(value, list) else [value]:
+            if isinstance(path, Path) and name not in _WRITTEN:
+                refuse_missing(path)
+    for options in made:
+        options.refuse_missing()
 
 
 def _offered(model: type[Options], field: str, info: FieldInfo) -> inspect.Parameter:

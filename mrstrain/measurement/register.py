@@ -90,6 +90,7 @@ def register(
     target = Path(out)
     load0, places = Path(load0), _places([Path(p) for p in loads], scans)
     cases, paths = list(places), list(places.values())
+    subject_files.refuse_missing()
     chosen = engine_of(registration, labelled=subject_files.labels is not None)
     _check_start(scans, chosen)
     given = [p for of in (subject_files, strokes, registration, scans, onto) for p in of.paths]

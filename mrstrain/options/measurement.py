@@ -1,5 +1,6 @@
 """Options of measuring: the subject, the registration, and where results are wanted."""
 
+import difflib
 import logging
 import shlex
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator
 
+from dvc.errors import InputError
 from dvc.threads import most_threads, usable_cores
 from mrstrain.options.model import Cli, Count, Flag, NotNegative, Options, Positive, Vector
 
@@ -114,6 +116,15 @@ class SubjectFiles(BoneAndBody):
     """Label map of the tissues on the unloaded image, or auto to make it from the image and --bone or --marks."""
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV."""
+
+    def refuse_missing(self) -> None:
+        """InputError for the first path at which there is nothing, other than labels "auto"."""
+        if self.labels == AUTO:
+            return self.model_copy(update={"labels": None}).refuse_missing()
+        is_close = difflib.get_close_matches(str(self.labels).lower(), [str(AUTO)])
+        if is_close and type(self) is SubjectFiles and not Path(str(self.labels)).exists():  # others make none
+            raise InputError(f"{self.labels}: no such file or folder. Did you mean {AUTO}? Check the spelling.")
+        super().refuse_missing()
 
 
 class ExistingFiles(SubjectFiles):

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar, Union, get_args, get
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.fields import FieldInfo
 
-from dvc.file_names import refuse_path
+from dvc.file_names import refuse_missing, refuse_path
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +105,11 @@ class Options(BaseModel):
     def paths(self) -> tuple[Path, ...]:
         """All paths among the fields."""
         return tuple(path for paths in self.files.values() for path in paths)
+
+    def refuse_missing(self) -> None:
+        """InputError for the first path at which there is nothing."""
+        for path in self.paths:
+            refuse_missing(path)
 
     def narrowed(self, model: type[_M]) -> _M:
         """The fields that these options share with another model, one of their bases."""

@@ -12,7 +12,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+import mrstrain
 from dvc import preset_names
+from dvc.errors import InputError
 from mrstrain.cli.app import app
 from mrstrain.cli.options import EXAMPLES
 from mrstrain.models.simulate import LOADS
@@ -87,6 +89,48 @@ def test_a_number_that_is_none_is_quoted_with_the_form_that_is_expected(given: s
     ran = CliRunner().invoke(app, ["register", "Load0.nii.gz", "Load1.nii.gz", "--out", "out", *given.split()])
     assert ran.exit_code == 2
     assert told in " ".join(ran.output.split())
+
+
+@pytest.mark.parametrize(
+    ("given", "missing"),
+    [
+        ("label nowhere.nii.gz --bone here --out t.nii.gz", "nowhere.nii.gz"),
+        ("register here here nowhere.nii.gz --align none --out r", "nowhere.nii.gz"),
+        ("register here here --bone nowhere.nii.gz --out r", "nowhere.nii.gz"),
+        ("register here here --labels auto --bone here/nowhere.nii.gz --out r", "here/nowhere.nii.gz"),
+        ("strain here nowhere.txt --out s", "nowhere.txt"),
+        ("twin nowhere.nii.gz here --out t", "nowhere.nii.gz"),
+        ("mesh nowhere.nii.gz --edge-mm 2 --out m.vtu", "nowhere.nii.gz"),
+        ("simulate nowhere.vtu --out s", "nowhere.vtu"),
+        ("compare here nowhere --out c", "nowhere"),
+    ],
+)
+def test_a_file_that_is_not_there_is_refused_before_anything_takes_time(given: str, missing: str, tmp_path) -> None:
+    (tmp_path / "here").touch()
+    main = "import sys; from mrstrain.cli.app import app\ntry: app()\nfinally: print(*sys.modules)"
+    ran = subprocess.run(
+        [sys.executable, "-c", main, *given.split()], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert f"InputError: {missing}: no such file or folder. Check the path." in ran.stderr
+    assert not {"nibabel", "dvc.worker", "psutil"} & {*ran.stdout.split()}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
+
+
+@pytest.mark.parametrize("typed", ["autp", "Auto", "aut0"])
+def test_a_word_close_to_auto_is_taken_for_it_where_there_is_no_such_file(typed: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    images = [tmp_path / "Load0.nii.gz", tmp_path / "Load1.nii.gz"]
+    for path in images:
+        path.touch()
+    given = [*map(str, images), "--bone", str(images[0]), "--labels", typed, "--out", "out"]
+    told = str(CliRunner().invoke(app, ["register", *given]).exception)
+    assert told == f"{typed}: no such file or folder. Did you mean auto? Check the spelling."
+    with pytest.raises(InputError, match="Did you mean auto"):
+        mrstrain.register(*images[:1], images[1:], labels=typed, bone=images[0], out="out")
+    strained = str(CliRunner().invoke(app, ["strain", *given[:4], "--labels", typed, "--out", "out"]).exception)
+    assert strained == f"{typed}: no such file or folder. Check the path."
+    (tmp_path / typed).touch()
+    assert "Did you mean" not in str(CliRunner().invoke(app, ["register", *given]).exception)
 
 
 @pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"doctor"}))  # which takes nothing

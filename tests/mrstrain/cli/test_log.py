@@ -180,7 +180,10 @@ def test_results_that_are_not_complete_are_followed_by_where_the_log_is(tmp_path
             return ["Load1: ONLY 40 % of the load was reached"]
 
     monkeypatch.setattr(mrstrain, "simulate", type("", (), {"with_options": lambda *_, **__: Done()}))
-    ran = CliRunner().invoke(app, ["simulate", "heel.vtu", "--set", "trebbi", "--out", str(tmp_path / "out")])
+    (tmp_path / "heel.vtu").touch()
+    ran = CliRunner().invoke(
+        app, ["simulate", str(tmp_path / "heel.vtu"), "--set", "trebbi", "--out", str(tmp_path / "out")]
+    )
     assert ran.exit_code == 1
     assert ran.output.split("Log:")[1].strip() == str(tmp_path / "out" / "log.txt")
     assert "ONLY 40 % of the load" in (tmp_path / "out" / "log.txt").read_text()
