@@ -116,9 +116,8 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
         own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
             f"{path}: only {100 * overlap:.0f} % of the model lies in the labelled soft tissue "
-            f"({100 * _LEAST_OVERLAP:.0f} % is needed). Model: {own}; tissue: {of_tissue} (LPS mm). Check that both "
-            "are of one subject, and the model's unit and frame (--model-unit mm or m, --model-frame LPS or RAS); or "
-            "give the rigid map to the image: to_image (--to-image)."
+            f"({100 * _LEAST_OVERLAP:.0f} % is needed). Model: {own}; tissue: {of_tissue} (LPS mm). Check subject, "
+            "unit (--model-unit) and frame (LPS or RAS, --model-frame), or map it to the image (--to-image)."
         )
     return overlap
 

@@ -97,7 +97,7 @@ class ErrorTable:
         return (
             f"The error bars were measured on phantoms (voxels of {_told(self.spacing_mm)} mm, SNR {self.snr:.0f}); "
             f"these images have {_told(spacing_mm)} mm and SNR {snr:.0f}, so they may cover more or less than 95 %. "
-            f"Measure {_measuring('yours', preset, spacing_mm, snr)}"
+            f"Measure yours with {_measuring(preset, spacing_mm, snr)}"
         )
 
     def expected(
@@ -149,8 +149,9 @@ class ErrorModel:
         if not nearest.far(spacing_mm, snr) <= _FAR:
             raise InputError(
                 f"The error of {self.preset} is not known for voxels of {_told(spacing_mm)} mm at SNR {snr:.0f}: the "
-                f"closest known, {_told(nearest.spacing_mm)} mm at SNR {nearest.snr:.0f}, is too far. Measure "
-                f"{_measuring('it', self.preset, spacing_mm, snr)}"
+                f"closest known, {_told(nearest.spacing_mm)} mm at SNR {nearest.snr:.0f}, is too far. Measure it with "
+                f"`mrstrain accuracy --preset {as_typed(self.preset)}` (--spacing, --snr); give its file as "
+                "error_model (--error-model)."
             )
         return nearest
 
@@ -237,13 +238,13 @@ def _parsed(told: Mapping[str, Any]) -> ErrorModel:
     return ErrorModel(str(told["preset"]), str(told["parameters_sha256"]), tables, str(told["source"]))
 
 
-def _measuring(what: str, preset: str, spacing_mm: FloatArray, snr: float) -> str:
+def _measuring(preset: str, spacing_mm: FloatArray, snr: float) -> str:
     """How an error model is made for voxels (3,) mm and an SNR, as the end of a sentence."""
     short, plane, long = np.sort(spacing_mm)  # two edges or more are alike
     across = max(short, long, key=lambda edge: abs(np.log(edge / plane)))
     slices = f" --slice-spacing {across:.2g}" if abs(np.log(across / plane)) > 0.01 else ""
     command = f"mrstrain accuracy --preset {as_typed(preset)} --spacing {plane:.2g}{slices} --snr {snr:.0f} --out DIR"
-    return f"{what} with `{command}`; give its file as --error-model."
+    return f"`{command}`; give its file as --error-model."
 
 
 def _told(spacing_mm: FloatArray) -> str:

@@ -131,7 +131,7 @@ def test_refusals_show_both_boxes(tmp_path) -> None:
     off = replace(aside, deformation=type(aside.deformation)(moved_away, aside.deformation.u_mm))
     with pytest.raises(GeometryError, match=r"Model: -9 to 11 x 0 to 20 .*tissue: 0.5 to 24 x -3.5 to 24") as told:
         misfits(off, labels(), ["bone"])
-    for words in ("(85 % is needed)", "--model-unit mm or m", "--model-frame LPS or RAS", "to_image (--to-image)"):
+    for words in ("(85 % is needed)", "(--model-unit)", "(LPS or RAS, --model-frame)", "(--to-image)"):
         assert words in str(told.value)
     file = ModelFile("heel", written(tmp_path, "vtu")["path"], ModelReading(model_unit="m"))
     grid = Grid((40, 40, 40), np.ones(3), np.array([-10.0, -35.0, 25.0]), np.eye(3))
