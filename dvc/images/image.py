@@ -11,6 +11,7 @@ import numpy.typing as npt
 from dvc.arguments import check
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, InputError, few
+from dvc.images.bone_names import is_bones_name
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -324,9 +325,11 @@ class LabelMap:
     def no_region(self, name: str) -> InputError:
         """The error for a name that no label has."""
         listed = few(sorted(self.names.values())) or "none"
+        bones = [known for known in self.names.values() if is_bones_name(known)]
+        likely = f" Did you mean '{bones[0]}'?" if is_bones_name(name) and len(bones) == 1 else ""
         unnamed = all(known.startswith("label-") for known in self.names.values())
         told = " No table of names was given (names; --names on the command line), so labels are named by number."
-        return InputError(f"The label map has no region '{name}'; it has {listed}.{told if unnamed else ''}")
+        return InputError(f"The label map has no region '{name}'; it has {listed}.{told if unnamed else likely}")
 
     def toward_lps(self) -> Self:
         """The same label map with its axes closest to L, P, S."""

@@ -11,6 +11,7 @@ from dvc.arguments import checked
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
+from dvc.images.bone_names import is_bones_name
 from dvc.images.bone_rim import bones_to_rims, reach_of
 from dvc.images.depth import depth_mm
 from dvc.images.image import Image, LabelMap, Mask
@@ -19,7 +20,6 @@ from dvc.images.tissue import tissue_mask, within
 from dvc.labelling.near_marks import certain, corrected_near
 from dvc.labelling.skin import Skin
 from dvc.labelling.tissues import TissueLabels
-from dvc.measurement.subject import is_bones_name
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,6 +12,7 @@ from dvc.arrays import Float32Array, frozen
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, RegistrationError
 from dvc.images.bias_field import without_bias_field
+from dvc.images.bone_names import is_bones_name
 from dvc.images.depth import depth_mm
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.images.tissue import tissue_mask
@@ -19,7 +20,7 @@ from dvc.io.images.labels import fit_mask
 from dvc.labelling.boundaries import correct_labels
 from dvc.labelling.near_marks import corrected_near
 from dvc.labelling.tissues import NAMES, TissueLabels, label_tissues
-from dvc.measurement.subject import bones_of, is_bones_name
+from dvc.measurement.subject import bones_of
 from dvc.registration.affine_fit import affine_fit, parts_of
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Settings, register

@@ -10,6 +10,7 @@ from dvc.arguments import checked
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
+from dvc.images.bone_names import is_bones_name
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import tissue_mask
@@ -18,7 +19,6 @@ from dvc.labelling.bones import bones_in
 from dvc.labelling.brightness import Levels, brighter_share, two_levels
 from dvc.labelling.marks import corrected, grown
 from dvc.labelling.skin import Skin
-from dvc.measurement.subject import is_bones_name
 
 NAMES = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
 """Numbers and names of the tissues that can be found without marks."""

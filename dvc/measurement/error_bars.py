@@ -12,9 +12,10 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
 from dvc.file_names import as_typed
+from dvc.images.bone_names import is_bones_name
 from dvc.images.depth import to_surface_mm
 from dvc.images.image import Grid, Mask
-from dvc.measurement.subject import Subject, is_bones_name
+from dvc.measurement.subject import Subject
 from dvc.registration.register import Registration
 from dvc.trust.components import ComponentUncertainty, components_of
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable

@@ -1,6 +1,5 @@
 """The unloaded image and what is known about it."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,21 +9,12 @@ import numpy as np
 from dvc.arrays import BoolArray, FloatArray, frozen
 from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
+from dvc.images.bone_names import is_bones_name
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.io.meshes.read import MeshFile
 from dvc.trust.error_model import POOLED
 
-_BONES = {
-    "bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform", "metatarsal",
-    "femur", "trochanter", "patella", "pelvis", "sacrum", "coccyx", "ilium", "ischium", "pubis", "vertebra",
-    "vertebrae", "hip", "rib", "sternum", "scapula", "clavicle", "humerus", "radius", "ulna", "tarsal", "phalanx",
-    "phalanges", "sesamoid",
-}  # fmt: skip
-_SOFT = {
-    "fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage", "bursa",
-    "nerve", "vessel", "artery", "vein", "capsule", "retinaculum", "meniscus", "disc", "marrow",
-}  # fmt: skip
 _HEEL = ("bone", "calcaneus")
 _INFERIOR = (0.0, 0.0, -1.0)
 _MOST_UNCERTAIN = 0.2  # of the voxels; .11 to .16 on the phantoms for which error bars were found to hold
@@ -158,14 +148,3 @@ def bones_of(labels: LabelMap, given: Sequence[str] = ()) -> tuple[str, ...]:
     if not names and any(name.startswith("label-") for name in labels.names.values()):
         return ("bone",)
     return tuple(sorted(names, key=lambda name: name.casefold() not in _HEEL))
-
-
-def is_bones_name(name: str) -> bool:
-    """Whether a label is named like a bone.
-
-    >>> [is_bones_name(name) for name in ("Talus", "tibia_left", "metatarsals", "fat pad", "ankle ligaments")]
-    [True, True, True, False, False]
-    """
-    words = set(re.split(r"[^a-z]+", name.lower()))
-    words |= {word.removesuffix("s") for word in words}
-    return bool(words & _BONES) and not words & _SOFT

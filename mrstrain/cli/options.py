@@ -145,7 +145,7 @@ class Grouped(TyperCommand):
             of = next((one for one in self.params if wrong.option_name in one.opts), None)
             value = "".join(re.findall(rf"(?:^|\0){wrong.option_name}[=\0]([^\0]*)", "\0".join(typed))[-1:])
             return "" if of is None else _in_a_row(wrong.option_name, value, of.nargs)
-        refused: list[dict[str, Any]] = getattr(wrong.__cause__, "errors", list)()
+        refused: Sequence[Any] = getattr(wrong.__cause__, "errors", list)()
         if kind != "BadParameter" or not refused or refused[0]["type"] not in _NO_NUMBER:
             return ""
         value = str(refused[0]["input"])

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import typer
 
-from dvc.measurement.subject import is_bones_name
+from dvc.images.bone_names import is_bones_name
 from mrstrain.studies.init import Answers, StudyInputs
 
 Read = Callable[[str], str]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import validate
-from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes, read_labels
+from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes
 from dvc.arrays import FloatArray
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
@@ -31,7 +31,7 @@ from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, ComparisonOn, ModelReading
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.records.durations import comparison as comparison_of
-from mrstrain.records.inputs import alone, output_folder, refuse_touching_inputs
+from mrstrain.records.inputs import alone, output_folder, read_given_labels, refuse_touching_inputs
 from mrstrain.records.progress import NOTE, OnProgress, expect
 from mrstrain.records.provenance import provenance
 
@@ -104,7 +104,7 @@ def compare(
     taken = taken_from_record(Path(dvc), (labels_given, labelling), (directions, usual), more=more)
     for line in taken:  # now, so that a wrong file is noticed before an hour is spent on it
         tell(NOTE, line, 0.0)
-    tissues = read_labels(labelling.labels, labelling.names)
+    tissues = read_given_labels(labelling.labels, labelling.names)
     bones = bones_of(tissues, labelling.bones)
     if not bones:
         names, name = ", ".join(tissues.names.values()), "Name a bone among them (--bone)."

@@ -8,8 +8,8 @@ import numpy as np
 
 from dvc import Subject
 from dvc.errors import InputError
+from dvc.images.bone_names import is_bones_name
 from dvc.io.result_folder import QUALITY
-from dvc.measurement.subject import is_bones_name
 from dvc.report.alike import alike
 from dvc.report.page import LOPSIDED, Cell, Estimate, Section, Table
 from dvc.trust.quality import NoiseFloor, read_noise_floor

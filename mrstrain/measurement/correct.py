@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import Image, correct_labels, fit_mask, read_labels, write_labels
+from dvc import Image, correct_labels, fit_mask, write_labels
 from dvc.atomic_files import write_json
 from dvc.labelling.boundaries import CorrectedLabels
 from dvc.report.drawing import Drawing
@@ -15,6 +15,7 @@ from dvc.report.page import Section, Table
 from mrstrain.measurement.label_files import LabelFiles, Labelled, view_of, volumes_ml
 from mrstrain.measurement.strokes import read_marks
 from mrstrain.options.measurement import GivenLabels, Marks
+from mrstrain.records.inputs import read_given_labels
 from mrstrain.records.provenance import provenance
 
 _LEAST_SHARE = 0.001  # told as one: the number of voxels says more where a stroke corrects a few
@@ -26,7 +27,7 @@ def corrected(
     """Correct a label map (`dvc.correct_labels`), and write it with its names, picture and record."""
     began = time.perf_counter()
     assert drawn.labels is not None
-    given = fit_mask(read_labels(drawn.labels, drawn.names), image.grid, str(drawn.labels))
+    given = fit_mask(read_given_labels(drawn.labels, drawn.names), image.grid, str(drawn.labels))
     marks = None if strokes.marks is None else read_marks(strokes.marks, strokes.mark_names)
     made = correct_labels(image, given, marks=marks, watch=watch)
     inputs = {"load0": load0, **{role: of[0] for role, of in (drawn.files | strokes.files).items()}}

@@ -16,7 +16,6 @@ from dvc import (
     label_tissues,
     labels_from,
     read_image,
-    read_labels,
     read_mask,
     write_labels,
     write_vectors,
@@ -33,6 +32,7 @@ from mrstrain.measurement.strokes import read_marks
 from mrstrain.options.door import door
 from mrstrain.options.measurement import BoneAndBody, GivenLabels, Marks
 from mrstrain.records.durations import TISSUES, labelling
+from mrstrain.records.inputs import read_given_labels
 from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import file_hash, provenance
 from mrstrain.records.time_left import WRITING
@@ -134,6 +134,6 @@ def _from_another(
             "`from_image` needs the label map of that image, `labels` (--from and --labels on the command line)."
         )
     assert drawn.from_image is not None
-    other, theirs = read_image(drawn.from_image), read_labels(drawn.labels, drawn.names)
+    other, theirs = read_image(drawn.from_image), read_given_labels(drawn.labels, drawn.names)
     refuse_one_image_twice([("The image to label", image), ("the other subject's", other)])
     return labels_from(image, other, theirs, bone, body, marks=marks, watch=tell)

@@ -12,9 +12,9 @@ import numpy as np
 from dvc import LabelMap, TissueLabels, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError, OutputError, few
+from dvc.images.bone_names import is_bones_name
 from dvc.io.images.read import read_header
 from dvc.io.result_folder import same_grid
-from dvc.measurement.subject import is_bones_name
 from dvc.own_files import read_json
 from dvc.report.drawing import ENDINGS
 from dvc.report.page import Section

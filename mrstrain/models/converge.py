@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 import fe
-from dvc import read_labels
 from dvc.atomic_files import write_csv, write_json, write_whole
 from dvc.errors import InputError, MrstrainError, few
 from dvc.measurement.subject import bones_of
@@ -33,7 +32,7 @@ from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
 from mrstrain.records.durations import PathSize, cells_of, meshing, simulations
-from mrstrain.records.inputs import alone, output_folder, refuse_touching_inputs
+from mrstrain.records.inputs import alone, output_folder, read_given_labels, refuse_touching_inputs
 from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import file_hash, provenance
 from mrstrain.records.time_left import Expected
@@ -109,7 +108,7 @@ def converge(
     inputs = {"labels": [Path(labels)], **labelling.files}
     refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], [Path(labels), *labelling.paths])
     tell, region, material = progress or (lambda *_: None), followed.region, followed.material
-    tissues = read_labels(labels, labelling.names)
+    tissues = read_given_labels(labels, labelling.names)
     known, bones = list(tissues.names.values()), bones_of(tissues, labelling.bones)
     labelling = labelling.model_copy(update={"bones": bones})
     if region not in known or region in bones:

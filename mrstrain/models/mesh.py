@@ -8,13 +8,14 @@ import numpy as np
 
 from dvc import Grid, LabelMap, TetMesh, read_labels, write_labels
 from dvc.errors import InputError, MrstrainError, OutputError
-from dvc.measurement.subject import bones_of, is_bones_name
+from dvc.images.bone_names import is_bones_name
+from dvc.measurement.subject import bones_of
 from dvc.report.drawing import ENDINGS, save_figure
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
 from mrstrain.options.modelling import Labelling, Meshing
 from mrstrain.records.durations import MESHING, cells_of, meshing as expected_of
-from mrstrain.records.inputs import alone, output_folder
+from mrstrain.records.inputs import alone, output_folder, read_given_labels
 from mrstrain.records.progress import OnProgress, expect
 from mrstrain.records.provenance import provenance
 from mrstrain.records.time_left import WRITING
@@ -97,7 +98,7 @@ def mesh(
     for path in (Path(labels), *labelling.paths):
         if path.resolve() in [target.resolve(), *written]:
             raise OutputError(f"{path} is an input and would be overwritten. Choose another output file (out).")
-    given = read_labels(labels, labelling.names)
+    given = read_given_labels(labels, labelling.names)
     with output_folder(target.parent), alone(target, target.with_name(f".{target.name}.lock")):
         how = meshing.model_dump()
         bones = bones_of(given, labelling.bones)

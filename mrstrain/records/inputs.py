@@ -1,5 +1,6 @@
 """What a command was given, read and checked before anything is computed."""
 
+import logging
 import re
 import shutil
 import warnings
@@ -10,11 +11,12 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock, Timeout
 
-from dvc import Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
+from dvc import LabelMap, Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import remove_partial
 from dvc.errors import InputError, OutputError, few
-from dvc.file_names import clash, is_utf8, refuse_as_file_name
+from dvc.file_names import as_typed, clash, is_utf8, refuse_as_file_name
+from dvc.io.images.labels import read_names
 from dvc.io.images.write import refuse_overwriting_inputs
 from dvc.io.result_folder import QUALITY, REPORT
 from dvc.measurement.subject import LabelsFromImage, plate_directions
@@ -24,8 +26,14 @@ from mrstrain.options.measurement import AUTO, MADE_LABELS, MeshAndAxes, Subject
 from mrstrain.records.log import begin_logs
 from mrstrain.records.provenance import file_hash
 
+_log = logging.getLogger(__name__)
 _LOCK = ".mrstrain-lock"
 _UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
+_NAMES_BESIDE = (
+    "%s: the labels have no names. There is a table of names beside it, %s; to use it, give it as names (--names %s on "
+    "the command line)."
+)
+TABLE_ENDINGS = (".csv", ".txt", ".label", ".ctbl")
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 
 
@@ -38,7 +46,7 @@ def read_subject(
     if files.labels == AUTO:
         raise InputError("Only register and run make a label map from the image. Make it with `mrstrain label` first.")
     if files.labels is not None:
-        label_map = fit_mask(read_labels(files.labels, files.names), reference.grid, str(files.labels))
+        label_map = fit_mask(read_given_labels(files.labels, files.names), reference.grid, str(files.labels))
     elif files.names is not None or files.bone_label is not None:
         raise InputError("names and bone_label need a label map (labels).")
     if files.bone is not None and files.bone_label is not None:
@@ -62,6 +70,18 @@ def read_subject(
     made = None if files.labels is None else made_from_image(files.labels)
     pressed = onto.plate_normal is not None or axes is not None
     return Subject(reference, bone, tissue, label_map, mesh, normal, axes, given, made, pressed)
+
+
+def read_given_labels(path: Path | str, names: Path | None) -> LabelMap:
+    """Read a label map; a note where its labels have no names, and a table of names lies beside it."""
+    labels, place = read_labels(path, names), Path(path)
+    if names is None and all(name == f"label-{number}" for number, name in labels.names.items()):
+        for table in (place.with_name(image_stem(place.name) + ending) for ending in TABLE_ENDINGS):
+            with suppress(InputError):  # no table of names
+                if table.is_file() and read_names(table).keys() >= labels.names.keys():
+                    _log.warning(_NAMES_BESIDE, place, table, as_typed(table))
+                    break
+    return labels
 
 
 def made_labels(out: Path) -> tuple[Path, Path]:

@@ -11,11 +11,12 @@ import numpy as np
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
 from dvc.errors import MrstrainError
 from dvc.file_names import as_typed
+from dvc.images.bone_names import is_bones_name
 from dvc.io.images.labels import read_names
 from dvc.io.result_folder import REPEAT
 from dvc.labelling.boundaries import correctable
 from dvc.labelling.tissues import NAMES
-from dvc.measurement.subject import bones_of, is_bones_name
+from dvc.measurement.subject import bones_of
 from dvc.trust.error_model import error_model_of
 from fe import (
     BONE,
@@ -325,8 +326,7 @@ class _Look:
                     self.tried(plate.check_gap, image_mm)
             self.at_tissues(reference, labels, chosen)
             return
-        mesh = self.tried(mesh_given, study)
-        if mesh is None:
+        if (mesh := self.tried(mesh_given, study)) is None:
             return
         if reference is not None:
             self.tried(check_overlap, mesh_place(study), mesh, reference.grid)

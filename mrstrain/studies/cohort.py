@@ -135,7 +135,7 @@ def _uncounted(one: StudyRun) -> str:
     compared = one.outcomes.get("compare")
     if compared is None:
         return "its study has no model to compare ([models] sets, results)."
-    return "" if compared.complete else f"compare {compared.status}. {compared.reason}".rstrip()
+    return "" if compared.complete else f"compare {compared.told}"
 
 
 def _areas(out: Path) -> list[dict[str, str]]:

@@ -12,13 +12,13 @@ from dvc import read_image, read_labels
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, OutputError
 from dvc.file_names import as_typed
+from dvc.images.bone_names import is_bones_name
 from dvc.io.images.dicom import is_dicom, is_multiframe
-from dvc.measurement.subject import is_bones_name
 from fe import BONE, published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.simulate import LOADS
 from mrstrain.options.modelling import Directions
-from mrstrain.records.inputs import IMAGE_ENDINGS, image_stem, named_unloaded
+from mrstrain.records.inputs import IMAGE_ENDINGS, TABLE_ENDINGS, image_stem, named_unloaded
 from mrstrain.studies.file import FILE
 
 _AGAIN = re.compile(r"again|repeat|rescan|retest", re.IGNORECASE)
@@ -44,7 +44,6 @@ _NAMES = (
 _LOOKED_AT = 20
 PICTURE = "study.png"
 _TO_FILL_IN = "# FILL IN"  # of lines in the template
-_TABLES = (".csv", ".txt", ".label", ".ctbl")
 
 
 @dataclass(slots=True)
@@ -271,5 +270,5 @@ def _role(stem: str) -> str | None:
 
 def _table(place: Path, image: str | None) -> str | None:
     """The table of label names that has the same file name as a label map."""
-    names = [] if image is None else [image_stem(image) + ending for ending in _TABLES]
+    names = [] if image is None else [image_stem(image) + ending for ending in TABLE_ENDINGS]
     return next((name for name in names if (place / name).is_file()), None)

@@ -186,7 +186,7 @@ def _incomplete(outcomes: Mapping[str, StageOutcome]) -> list[str]:
     alike: dict[str, list[str]] = {}
     for one in outcomes.values():
         if not (one.complete or one.left_out):
-            why = one.reason.partition("\n")[0].removeprefix("Not run: ").rstrip(".")
+            why = one.why.partition("\n")[0].rstrip(".")
             alike.setdefault(f"{one.status.lower()}" + (f" ({why})" if why else ""), []).append(one.stage)
     incomplete = [f"{', '.join(stages)}: {how}" for how, stages in alike.items()]
     return [*([f"Incomplete: {'; '.join(incomplete)}."] if incomplete else []), *left_out_of(outcomes)]

@@ -29,7 +29,19 @@ class StageOutcome:
     requested: bool = True  # the stage was among those that may be run
 
     def __str__(self) -> str:
-        return f"{self.stage}: {self.status}. {self.reason}".rstrip()
+        return f"{self.stage}: {self.told}"
+
+    @property
+    def why(self) -> str:
+        """Why it was not run, or is not complete, without its status."""
+        return self.reason.removeprefix(_NOT_RUN)
+
+    @property
+    def told(self) -> str:
+        """Its status, and why."""
+        if self.status == "not run":
+            return f"not run ({self.why.rstrip('.')})."
+        return f"{self.status}. {self.reason}".rstrip()
 
     @property
     def result(self) -> StageResult:
@@ -41,6 +53,8 @@ class StageOutcome:
         """What was found, or why there is no result, in a line."""
         if self.complete:
             return self.result.headline or self.status
+        if self.status == "not run":
+            return self.told
         why = self.reason.partition("\n")[0] or self.result.headline
         return f"{self.status}. {why}" if why else self.status
 
@@ -155,7 +169,7 @@ class Pipeline:
         return {
             name: _TO_RUN if name in to_run
             else "not requested" if not outcome.requested
-            else f"cannot run: {outcome.reason.removeprefix(_NOT_RUN)}" if outcome.record is None
+            else f"cannot run: {outcome.why}" if outcome.record is None
             else "up to date"
             for name, outcome in trial.in_order().items()
         }  # fmt: skip

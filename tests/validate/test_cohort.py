@@ -107,7 +107,7 @@ def compared(folder: Path, name: str, near: float, far: float) -> Path:
     [
         (
             StageOutcome("compare", None, "Not run: none of register Load1 has a result."),
-            "compare not run. Not run: none",
+            "compare not run (none of register Load1 has a result).",
         ),
         (StageOutcome("compare", None, "The label map has no 'bone'."), "compare FAILED. The label map has no 'bone'."),
         (None, "its study has no model to compare"),

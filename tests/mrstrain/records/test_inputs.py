@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from dvc.errors import InputError, MrstrainError, OutputError
-from dvc.images.image import Grid, Image
-from dvc.io.images.write import write_image
+from dvc.images.image import Grid, Image, LabelMap
+from dvc.io.images.write import write_image, write_labels
 from mrstrain.measurement.register import register
 from mrstrain.options.measurement import MeshAndAxes, SubjectFiles
 from mrstrain.records.inputs import (
     alone,
     case_names,
     make_output,
+    read_given_labels,
     read_matrix,
     read_subject,
     refuse_small_disk,
@@ -24,6 +25,28 @@ from mrstrain.records.inputs import (
     swapped_by_name,
 )
 from mrstrain.studies.run import run_studies
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt"])
+def test_a_table_of_names_beside_a_label_map_is_pointed_to_and_not_taken(tmp_path: Path, caplog, ending: str) -> None:
+    place, table = tmp_path / "my tissues.nii.gz", tmp_path / f"my tissues{ending}"
+    grid = Grid((4, 1, 1), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    write_labels(place, LabelMap(grid, np.array([0, 5, 5, 7]).reshape(4, 1, 1), {5: "fat", 7: "bone"}))
+    (tmp_path / "my tissues.csv").unlink(missing_ok=True)
+    rows = {".csv": "label,name\n5,fat\n7,bone\n", ".txt": '5 0 0 0 1 1 1 "fat"\n7 0 0 0 1 1 1 "bone"\n'}[ending]
+    table.write_text(rows)
+    assert read_given_labels(place, None).names == {5: "label-5", 7: "label-7"}
+    (note,) = (one.getMessage() for one in caplog.records)
+    assert note.startswith(f"{place}: the labels have no names. There is a table of names beside it, {table};")
+    assert f"(--names '{table}' on the command line)" in note
+    caplog.clear()
+    assert read_given_labels(place, table).names == {5: "fat", 7: "bone"}
+    for other in (rows.splitlines()[0] + "\n", rows.rpartition("7")[0], "of something else\n"):
+        table.write_text(other)
+        read_given_labels(place, None)
+    table.rename(tmp_path / f"other{ending}")
+    read_given_labels(place, None)
+    assert not caplog.records
 
 
 @pytest.mark.parametrize(

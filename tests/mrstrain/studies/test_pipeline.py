@@ -168,7 +168,8 @@ def test_what_cannot_do_without_a_failed_one_is_not_run(folder):
     first, outcomes, _ = ran(folder, failing=("mesh",))
     assert "simulate a" not in first
     assert outcomes["simulate a"].status == "not run"
-    assert outcomes["simulate a"].reason == "Not run: mesh has no result."
+    assert str(outcomes["simulate a"]) == "simulate a: not run (mesh has no result)."
+    assert outcomes["simulate a"].headline == "not run (mesh has no result)."
     _, outcomes, _ = ran(folder, failing=("mesh", "register a", "register b"), force=("register",))
     assert outcomes["compare"].status == "not run"
     assert (folder / "results" / "compare").exists()  # nothing that was finished is lost

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,25 @@ class TestReadLabels:
         np.testing.assert_array_equal(labels.labels, _block(5))
         with pytest.raises(InputError, match=r"no region 'bone'; it has label-5. No table of names was given"):
             labels.region("bone")
+
+    @pytest.mark.parametrize(
+        ("asked", "names", "likely"),
+        [
+            ("calcaneus", ("bone", "fat"), "'bone'"),
+            ("bone", ("calcaneus", "fat", "skin"), "'calcaneus'"),
+            ("calcaneus", ("talus", "tibia"), ""),
+            ("calcaneus", ("fat", "skin"), ""),
+            ("muscle", ("bone", "fat"), ""),
+        ],
+    )
+    def test_a_bone_of_another_name_is_pointed_to_where_there_is_one(
+        self, asked: str, names: tuple[str, ...], likely: str
+    ) -> None:
+        grid, known = Grid((4, 1, 1), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), dict(enumerate(names, 1))
+        labels = LabelMap(grid, np.resize([*known], (4, 1, 1)), known)
+        told = f"; it has {', '.join(names)}." + (f" Did you mean {likely}?" if likely else "")
+        with pytest.raises(InputError, match=re.escape(told) + "$"):
+            labels.region(asked)
 
     def test_names_that_are_not_in_the_map_are_let_go(self, tmp_path: Path) -> None:
         path = _save(tmp_path / "a.nii", _block(5))
