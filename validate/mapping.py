@@ -172,7 +172,8 @@ def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.n
     Case does not matter where it does not distinguish labels: Abaqus writes names in capitals.
     """
     names = set(labels.names.values())
-    in_any_case = {name.casefold(): name for name in labels.names.values()}
+    folded = [name.casefold() for name in labels.names.values()]
+    in_any_case = {name.casefold(): name for name in labels.names.values() if folded.count(name.casefold()) == 1}
     tissue = np.full(len(mesh.cells), UNNAMED, dtype=f"<U{max(len(n) for n in (*names, UNNAMED))}")
     nearest = np.rint(labels.grid.indices_of(mesh.centroids_mm)).astype(np.int64)
     inside = ((nearest >= 0) & (nearest < np.array(labels.grid.shape))).all(axis=1)

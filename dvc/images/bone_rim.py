@@ -33,6 +33,7 @@ def reach_of(spacing_mm: FloatArray) -> float:
 def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     """The bone of a mask, with its surface at the outer edge of its dark rim; see `bones_to_rims`.
 
+    Without labels, tendon at the bone counts as rim. A part of the bone without a rim may move too.
     ``image`` has no bias field; the bone and the ``body``, bone included, are on its grid.
     """
     spacing = image.grid.spacing_mm

@@ -65,8 +65,11 @@ def on_one_scale(sections: Sequence[Section], subject: Subject, folders: Mapping
     ``folders`` are those of the loads, by the sections' titles; a repeat scan has the colours of the loads. A picture
     stays if its files are missing or damaged.
     """
+    loads = [folder for folder in folders.values() if folder.name != REPEAT]
+    if not loads:
+        return list(sections)
     try:
-        scale = shared_scale(folder for folder in folders.values() if folder.name != REPEAT)
+        scale = shared_scale(loads)
         return [_on_scale(one, subject, folders[one.title], scale) if one.title in folders else one for one in sections]
     except MrstrainError:
         return list(sections)

@@ -162,7 +162,7 @@ def scale_told(end: float, *, shared: bool) -> str:
         "All maps of the maximum shear strain in this report have one colour scale. It" if shared else "The scale"
     )
     of = "under the load with the largest strain, " if shared else ""
-    rule = f"the 99th percentile of the measured strain, {of}rounded up to the next multiple of 0.05 (at most 0.5)"
+    rule = f"the 99th percentile of the measured strain, {of}rounded up to a multiple of 0.05, from 0.05 to 0.5"
     return f"{all_maps} ends at {end:g}: {rule}. Larger strain has the last colour."
 
 

@@ -28,7 +28,7 @@ from mrstrain.records.provenance import file_hash
 
 _log = logging.getLogger(__name__)
 _LOCK = ".mrstrain-lock"
-_UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
+_UNLOADED = re.compile(r"load[ _-]?0(?![.\d]*\d)|unloaded|(?<![a-z])no[ _-]?load|baseline", re.IGNORECASE)
 _NAMES_BESIDE = (
     "%s: the labels have no names. There is a table of names beside it, %s; to use it, give it as names (--names %s on "
     "the command line)."

@@ -31,9 +31,10 @@ _NOTE = (
 )
 _NOTE_AT_BONE = (
     "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid. This surface is placed "
-    "at the dark rim of the bone in the unloaded image, up to 2.5 voxels from that of the mask; the key results of the "
-    "bone are those of the preceding smooth spline. The whole motion, that of the bone included, is in transform.h5, "
-    "as displacements at voxels. No elastix text files are written, because elastix has no spline with discontinuities."
+    "at the dark rim of the bone in the unloaded image, up to 2.5 mean voxel edges from that of the mask; the key "
+    "results of the bone are those of the preceding smooth spline. The whole motion, that of the bone included, is in "
+    "transform.h5, as displacements at voxels. No elastix text files are written, because elastix has no spline with "
+    "discontinuities."
 )
 
 
@@ -219,7 +220,8 @@ class GaussNewtonWithInterfaces(Engine):
 class GaussNewtonAtBone(Engine):
     """Strain may be discontinuous at the surface of the bone, which is rigid; no label map is needed.
 
-    The surface is that of the mask, moved to the outer edge of the bone's dark rim by up to 2.5 voxels.
+    The surface is that of the mask, moved to the outer edge of the bone's dark rim by up to 2.5 mean voxel edges. A
+    part of the bone without such a rim may be moved all the same.
 
     Attributes
     ----------

@@ -134,6 +134,7 @@ def test_a_damaged_matrix_is_refused_and_warns_of_nothing(tmp_path: Path, text: 
         ("Load1.nii.gz", ["Load2.nii.gz", "load_0.nrrd"], "load_0.nrrd"),
         ("Load0.nii.gz", ["Load1.nii.gz", "Load0-again.nii.gz"], ""),
         ("a.nii.gz", ["b.nii.gz"], ""),
+        ("heel.nii.gz", ["load01.nii.gz", "Load_05N.nii.gz", "load0.5kg.nii.gz", "mono_load1.nii.gz"], ""),
     ],
 )
 def test_images_that_their_names_say_are_swapped_are_told(load0: str, loads: list[str], odd: str, tmp_path) -> None:
