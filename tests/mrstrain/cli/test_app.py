@@ -210,8 +210,11 @@ def test_settings_for_other_programs_do_not_stop_a_command(tmp_path: Path) -> No
     assert (tmp_path / "a" / "fit.png").exists()
 
 
-def test_only_what_was_typed_counts_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_was_typed_counts_as_given(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen = list[set[str]]()
+    monkeypatch.chdir(tmp_path)
+    for name in ("dvc", "model"):
+        (tmp_path / name).mkdir()
     monkeypatch.setattr(
         "mrstrain.cli.models.carry_out", lambda *_, reading, **__: seen.append(reading.model_fields_set)
     )
