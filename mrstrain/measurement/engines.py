@@ -15,6 +15,8 @@ from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 
 GAUSS_NEWTON, ELASTIX = GaussNewton.family, Elastix.family
+WITH_LABELS = GaussNewtonWithInterfaces().name
+"""The engine of a registration with a label map."""
 
 
 def _asked(how: EngineOptions) -> str:

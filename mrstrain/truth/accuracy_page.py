@@ -8,11 +8,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from dvc import GaussNewton
 from dvc.registration.engines import DEFAULT
 from dvc.report.drawing import Drawing
 from dvc.report.page import Cell, Picture, Section, Table
 from dvc.trust.error_model import POOLED
+from mrstrain.measurement.engines import GAUSS_NEWTON
 from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wavelength_recovered
 
 _R = TypeVar("_R", ErrorRow, ResolutionRow)
@@ -142,7 +142,7 @@ def _sentence(condition: _Condition, errors: Sequence[ErrorRow], floors: Sequenc
     over = f" over {len(motions)} motions, with their range" if len(motions) > 1 else ""
     told = [f"the max. shear has an error (RMSE{over}) of {_listed(error)}"] if error else []
     told += [f"the noise floor (median) is {_listed(floor)}"] if floor else []
-    labels = " without a label map" if preset == GaussNewton.name else ""
+    labels = " without a label map" if preset == GAUSS_NEWTON else ""
     return f"With {preset}{labels}, voxels of {voxel} mm and SNR {snr:g}, {'; '.join(told)}."
 
 

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import phantoms
-from dvc import GaussNewton, GaussNewtonWithInterfaces, engine_named
+from dvc import engine_named
 from dvc.atomic_files import whole_folder, write_csv, write_json
 from dvc.io.result_folder import FIGURES, PROVENANCE, REPORT
 from dvc.report.page import record_lines, write_report
+from mrstrain.measurement.engines import GAUSS_NEWTON, WITH_LABELS
 from mrstrain.records.provenance import provenance
 from mrstrain.truth.accuracy_page import HOW_TO_READ, answers, motion_of, sections_of
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow
@@ -88,12 +89,11 @@ class AccuracyStudy:
     def without_labels(self) -> list[str]:
         """A sentence if the engine that `register` uses with a label map was measured without one alone."""
         measured = {row.preset for row in (*self.errors, *self.resolution)}
-        with_labels = GaussNewtonWithInterfaces.name
-        if GaussNewton.name not in measured or with_labels in measured:
+        if GAUSS_NEWTON not in measured or WITH_LABELS in measured:
             return []
         return [
-            f"{GaussNewton.name} was measured without a label map. `register --labels` uses {with_labels}; measure "
-            f"its error with `--preset {with_labels}`."
+            f"{GAUSS_NEWTON} was measured without a label map. `register --labels` uses {WITH_LABELS}; measure its "
+            f"error with `--preset {WITH_LABELS}`."
         ]
 
     def summary(self) -> list[str]:
