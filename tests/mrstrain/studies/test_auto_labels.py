@@ -92,7 +92,7 @@ def test_a_series_makes_its_label_map_as_a_study_does(study, tmp_path, in_this_p
     ("given", "told"),
     [
         ({}, "labels auto also needs the mask of the bone"),
-        ({"bone": "calcaneus.nii.gz", "names": "names.csv"}, "`names` is for a label map of your own"),
+        ({"bone": "calcaneus.nii.gz", "names": "study.toml"}, "`names` is for a label map of your own"),
         ({"bone": "calcaneus.nii.gz", "allow_missing": True}, "cannot be combined with `allow_missing`"),
         ({"bone": "calcaneus.nii.gz", "loads": ["labels.nii.gz"]}, "A loaded image is named 'labels'"),
     ],
