@@ -33,26 +33,28 @@ def reach_of(spacing_mm: FloatArray) -> float:
 def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     """The bone of a mask, with its surface at the outer edge of its dark rim; see `bones_to_rims`.
 
-    Without labels, tendon at the bone counts as rim. A part of the bone without a rim may move too.
+    The surface stays where nothing within reach is as dark as a rim. Without labels, tendon at the bone counts as rim.
     ``image`` has no bias field; the bone and the ``body``, bone included, are on its grid.
     """
     spacing = image.grid.spacing_mm
     box = bone.box(int(np.ceil((reach_of(spacing) + _TRUNCATE * _AROUND_MM) / spacing.min())))
     part = fill_missing(Image(image.grid.part(box), image.values[box]))
     given, found = bone.inside[box], bone.inside.copy()
-    found[box] = bones_to_rims(part.values, given, body.inside[box] & ~given, (), spacing)
+    found[box] = bones_to_rims(part.values, given, body.inside[box] & ~given, (), spacing, rims_have_gaps=True)
     return Mask(bone.grid, found)
 
 
 def bones_to_rims(
-    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray
-) -> BoolArray:
+    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray, *,
+    rims_have_gaps: bool = False,
+) -> BoolArray:  # fmt: skip
     """Bones (ni, nj, nk) whose surfaces lie within reach of those given, at the outer edge of their dark rims.
 
     From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim. The
     bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Where the image shows no such edge,
     and beside those of the ``tissues`` that are as dark as a rim, such as tendon, surfaces stay. ``values`` are of an
-    image without its bias field and without missing voxels.
+    image without its bias field and without missing voxels. If ``rims_have_gaps``, surfaces also stay farther than the
+    reach from everything as dark as a rim.
     """
     from skimage.segmentation import watershed  # takes longer to import than most registrations have time for
 
@@ -68,13 +70,14 @@ def bones_to_rims(
     beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
     dark = float(np.percentile(blurred[near], _DARK_PERCENT))
     rim = near & (blurred < dark + _EDGE * (beside - dark))
+    known = distance_transform_edt(~rim, sampling=spacing_mm) <= reach_mm if rims_have_gaps else near
     thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
     rim &= distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm
     found = (inner | rim) & (soft | given)
     joined, _ = label(found)
     found = np.isin(joined, np.unique(joined[core])) & found
     found |= binary_fill_holes(found)
-    seen = near & (beside > _LEAST_STEP * dark)
+    seen = near & known & (beside > _LEAST_STEP * dark)
     for tissue in tissues:
         if float(np.median(blurred[tissue])) < _LEAST_STEP * dark:
             seen &= distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_mm

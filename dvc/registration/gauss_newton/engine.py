@@ -220,8 +220,8 @@ class GaussNewtonWithInterfaces(Engine):
 class GaussNewtonAtBone(Engine):
     """Strain may be discontinuous at the surface of the bone, which is rigid; no label map is needed.
 
-    The surface is that of the mask, moved to the outer edge of the bone's dark rim by up to 2.5 mean voxel edges. A
-    part of the bone without such a rim may be moved all the same.
+    The surface is that of the mask, moved to the outer edge of the bone's dark rim by up to 2.5 mean voxel edges, where
+    there is one.
 
     Attributes
     ----------
