@@ -47,7 +47,8 @@ STAGE = {
 }  # fmt: skip
 """Every number that decides the result of this stage, for a record."""
 STAGE_AT_BONE = {
-    "steps": _STEPS, "of_jumps": STAGE["of_jumps"], "distances": NUMBERS, "laplacians": _WITH_JUMPS, "rim": OF_RIM | {"may_have_gaps": True},
+    "steps": _STEPS, "of_jumps": STAGE["of_jumps"], "distances": NUMBERS, "laplacians": _WITH_JUMPS,
+    "rim": OF_RIM | {"may_have_gaps": True},
 }  # fmt: skip
 """The same where the bone is the only tissue that is known."""
 
