@@ -92,7 +92,10 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None, largest
     across = (fields.mesh.points_mm - point) @ axes[:, 2]
     if not across.min() < 0.0 < across.max():
         point, through = middle, f"The slice goes through the middle of the mesh, since {_place(one)} is outside of it."
-    slices, through = (one, measured, displacements, point, largest), f"{through} {scale_told(largest, shared=True)}"
+    slices, through = (
+        (one, measured, displacements, point, largest),
+        f"{through} {scale_told(largest, among='comparison')}",
+    )
     agreement = figures.agreement_bins(fields)
     drawings = {
         "curves": Drawing.of(
@@ -192,7 +195,7 @@ def drawings_of_all(
     only = sum(not area.levelled for area in ranking.areas) == 1
     best = "the only model" if only else "the best match over all loads" if informative else "a model"
     note = f"Measured, and simulated by {model}, {best}. {strips[0].title}, through {strips[0].place}. "
-    note += scale_told(largest, shared=True)
+    note += scale_told(largest, among="comparison")
     slices, of_all = (strips, (MEASURED, model), largest), [curve for curve in curves if curve.tissue == ALL]
     first = Drawing.of("Measured and simulated strain", strain_by_load, *slices, note=note)
     return {

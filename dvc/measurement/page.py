@@ -85,7 +85,8 @@ def strain_drawing(
     through = "Slices through the middle of the tissue."
     if subject.bone is not None:
         through = "Slices through the point of the bone that is nearest to the plate."
-    shown, note = (max_shear, largest, labels), f"{through} {figures.scale_told(largest, shared=shared is not None)}"
+    among = "" if shared is None else "report"
+    shown, note = (max_shear, largest, labels), f"{through} {figures.scale_told(largest, among=among)}"
     drawing = Drawing.of(STRAIN, figures.strain_slices, view, subject.reference, *shown, note=note)
     if registered is None:
         return drawing

@@ -49,7 +49,7 @@ def measured_by_load(subject: Subject, folders: Mapping[str, Path]) -> Drawing:
     note = f"{strips[0].title}, through {where}."
     largest = shared_scale(folders.values())
     drawn_of = strips, (MEASURED,), largest
-    note += f" {scale_told(largest, shared=True)}"
+    note += f" {scale_told(largest, among='report')}"
     drawn = Drawing.of("Maximum shear strain under each load", strain_by_load, *drawn_of, note=note)
     return replace(drawn, narrow=narrow_by_load(*drawn_of))
 

@@ -156,14 +156,14 @@ def shear_scale(*fields: Values) -> float:
     return float(np.clip(np.ceil(20.0 * most - 1e-6) / 20.0, _LEAST_SCALE, _MOST_SCALE))
 
 
-def scale_told(end: float, *, shared: bool) -> str:
-    """Where the colours of the maximum shear strain end, for a caption; ``shared`` by all maps of a report, or not."""
-    all_maps = (
-        "All maps of the maximum shear strain in this report have one colour scale. It" if shared else "The scale"
-    )
-    of = "under the load with the largest strain, " if shared else ""
+def scale_told(end: float, *, among: str = "") -> str:
+    """Where the colours of the maximum shear strain end, for a caption; ``among`` says of what all maps share them."""
+    first, of = "The scale", ""
+    if among:
+        first = f"All maps of the maximum shear strain in this {among} have one colour scale. It"
+        of = "under the load with the largest strain, "
     rule = f"the 99th percentile of the measured strain, {of}rounded up to a multiple of 0.05, from 0.05 to 0.5"
-    return f"{all_maps} ends at {end:g}: {rule}. Larger strain has the last colour."
+    return f"{first} ends at {end:g}: {rule}. Larger strain has the last colour."
 
 
 def round_up(value: float) -> float:

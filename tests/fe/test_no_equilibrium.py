@@ -66,7 +66,7 @@ def test_it_ends_within_a_minute_with_its_cause(
     notes = " ".join(done.notes)
     assert f"a: {TOLD}" in notes
     assert re.search(cause, notes)
-    assert ("small increments are not tried below half of the normal load" in notes) == (most < MOST_STEPS)
+    assert ("below half of the normal load, few and no small increments are tried" in notes) == (most < MOST_STEPS)
     assert counted.steps < most
     assert counted.seconds < MINUTE
 
