@@ -4,6 +4,7 @@ Strain is smooth inside a tissue, but not across its border: fat that shears alo
 right up to them. One B-spline for all carries that strain over the border, as far as its control points lie apart.
 """
 
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Self
@@ -14,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from dvc import threads
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.compiled import njit
-from dvc.deformation.bspline import ALIGNED_INDEX, BSpline, evaluate_spline, indices_along_axes, summed_spline
+from dvc.deformation.bspline import ALIGNED_INDEX, BSpline, indices_along_axes, summed_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
 from dvc.images.depth import NUMBERS as OF_DEPTH, depth_mm
@@ -89,24 +90,20 @@ class Interfaces:
         """The borders of a body that is turned about the world's origin."""
         return replace(self, grid=self.grid.moved_by(rotation, np.zeros(3)))
 
-    def at_voxels(self) -> FloatArray:
-        """Factors at the voxels, (ni, nj, nk, 2, 4): of m and psi the value, and the gradient along the grid's axes.
+    def at_voxels(self, where: BoolArray, every: Iterable[int] = (1, 1, 1), gradient: bool = True) -> FloatArray:
+        """Factors at every so many voxels along each axis, ``where`` (mi, mj, mk) of these; zero at the others.
 
-        On a border the gradient is that of the voxel's own side.
+        (mi, mj, mk, 2, 4): of m and psi the value, and the gradient along the grid's axes; without gradient
+        (mi, mj, mk, 2, 1). On a border the gradient is that of the voxel's own side.
         """
-        out = np.empty((*self.grid.shape, 2, 4))
+        out = np.zeros((*where.shape, 2, 4 if gradient else 1))
+        along = tuple(step * np.arange(n) for step, n in zip(every, where.shape, strict=True))
         for start in range(0, len(out), _PLANES):  # of all at once, depths and slopes would take twice as much as these
             planes = slice(start, start + _PLANES)
-            own = self.own[planes]
-            depth, slope = np.zeros(own.shape), np.zeros((*own.shape, 3))
-            for number in range(len(self.depth)):
-                mine = own == number
-                depth[mine], slope[mine] = self._at_voxels(number, mine, start)
-            away, toward = np.full(own.shape, np.inf), np.zeros_like(slope)
-            if self.rest >= 0:
-                bone, into = self._at_voxels(self.rest, np.ones(own.shape, dtype=bool), start)
-                away, toward = -bone.reshape(own.shape), -into.reshape(slope.shape)
-            out[planes] = self._factors(depth, slope, away, toward, own)
+            some, here = frozen(where[planes], np.bool_), (along[0][planes], *along[1:])
+            own, depth, slope = self._depths(some, np.arange(3), here, gradient, corners=1)
+            slope /= self.grid.spacing_mm
+            out[planes][some] = self._factors(depth[0], slope[0], -depth[1], -slope[1], own)
         return out
 
     def at(self, points_mm: FloatArray, gradient: bool = True) -> FloatArray:
@@ -125,11 +122,17 @@ class Interfaces:
         if placed is None or any(np.abs(t - np.rint(t)).max() > ALIGNED_INDEX for t in placed[1]):
             return self.at(grid.points(where), gradient)
         order, along = np.argsort(placed[0]), tuple(np.rint(t).astype(np.int64) for t in placed[1])
+        return self._of_depths(*self._depths(frozen(where, np.bool_), order, along, gradient, corners=8))
+
+    def _depths(
+        self, where: BoolArray, order: IntArray, along: Sequence[IntArray], gradient: bool, corners: int
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Tissue, depths and slopes by index of voxels, as `_depths_at_voxels`."""
         begun = np.concatenate([[0], np.cumsum(np.count_nonzero(where, axis=(1, 2)))])
         found = _room_for(int(begun[-1]), gradient)
-        given = self.depth, self.own, self.rest, order, along, frozen(where, np.bool_), begun, gradient
+        given = self.depth, self.own, self.rest, order, tuple(along), where, begun, gradient, corners
         in_parts(_depths_at_voxels, len(where), *given, *found)
-        return self._of_depths(*found)
+        return found
 
     def _of_depths(self, own: IntArray, depth: FloatArray, slope: FloatArray) -> FloatArray:
         """Factors at points from the depths there; their slopes are by index."""
@@ -153,12 +156,6 @@ class Interfaces:
             out[own == self.rest] = 0.0
         return out
 
-    def _at_voxels(self, number: int, where: BoolArray, start: int) -> tuple[FloatArray, FloatArray]:
-        """Depth (n,) in a tissue, mm, at voxels of planes from ``start``; its gradient (n, 3) along the grid's axes."""
-        indices = np.argwhere(where) + np.array([float(start), 0.0, 0.0])
-        depth, per_voxel = evaluate_spline(self.depth[number : number + 1], indices, mirror=True)
-        return depth[:, 0], per_voxel[:, 0] / self.grid.spacing_mm
-
 
 def _room_for(count: int, gradient: bool) -> tuple[IntArray, FloatArray, FloatArray]:
     """Arrays for each point's own tissue, its depths (2, n) and their slopes (2, n, 3), or none of these."""
@@ -166,15 +163,18 @@ def _room_for(count: int, gradient: bool) -> tuple[IntArray, FloatArray, FloatAr
 
 
 @njit(nogil=True, cache=True)
-def _deepest(n, depth, own, rest, at, values, slopes, gradient, tissue, value, slope):  # type: ignore[no-untyped-def]
-    """Point n: the tissue of the eight voxels around it that it lies deepest in; depths and slopes as `_depths_at`.
+def _deepest(  # type: ignore[no-untyped-def]
+    n, depth, own, rest, at, values, slopes, gradient, corners, tissue, value, slope
+):  # fmt: skip
+    """Point n: the tissue of the voxels around it that it lies deepest in; depths and slopes as `_depths_at`.
 
-    ``at`` are the indices of coefficients along each axis, the second that of the voxel before the point; ``values``
-    and ``slopes`` are the weights of these coefficients.
+    There are eight ``corners``; if one, it is the voxel before the point along each axis. ``at`` are the indices of
+    coefficients along each axis, the second that of the voxel before the point; ``values`` and ``slopes`` are the
+    weights of these coefficients.
     """
     tissue[n], value[:, n] = 0, -np.inf
     tried = -1
-    for corner in range(8):
+    for corner in range(corners):
         number = own[at[0][1 + (corner >> 2)], at[1][1 + (corner >> 1 & 1)], at[2][1 + (corner & 1)]]
         if number == tried or (corner and number == tissue[n]):
             continue
@@ -211,16 +211,18 @@ def _depths_at(
         b, db = spline_basis(y - j)
         c, dc = spline_basis(z - k)
         at = indices_around(i, ni), indices_around(j, nj), indices_around(k, nk)
-        _deepest(n, depth, own, rest, at, (a, b, c), (da, db, dc), gradient, tissue, value, slope)
+        _deepest(n, depth, own, rest, at, (a, b, c), (da, db, dc), gradient, 8, tissue, value, slope)
 
 
 @njit(nogil=True, cache=True)
 def _depths_at_voxels(
     start: int, stop: int, depth: FloatArray, own: IntArray, rest: int, order: IntArray,
-    along: tuple[IntArray, IntArray, IntArray], where: BoolArray, begun: IntArray, gradient: bool,
+    along: tuple[IntArray, IntArray, IntArray], where: BoolArray, begun: IntArray, gradient: bool, corners: int,
     tissue: IntArray, value: FloatArray, slope: FloatArray,
 ) -> None:  # fmt: skip
     """As `_depths_at`, at whole indices, where splines have three coefficients along each axis.
+
+    With one of the ``corners`` a voxel's own tissue is its own; with eight, that of a neighbour may be.
 
     ``along`` are the indices of voxels ``where`` (ni, nj, nk), in the order of these axes; ``order`` is the place of
     each axis of the interfaces among them; ``begun[i]`` voxels lie before the slab i.
@@ -239,7 +241,7 @@ def _depths_at_voxels(
                 at = (
                     indices_around(x, shape[0])[:3], indices_around(y, shape[1])[:3], indices_around(z, shape[2])[:3],
                 )  # fmt: skip
-                _deepest(n, depth, own, rest, at, values, slopes, gradient, tissue, value, slope)
+                _deepest(n, depth, own, rest, at, values, slopes, gradient, corners, tissue, value, slope)
                 n += 1
 
 

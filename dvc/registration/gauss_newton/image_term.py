@@ -14,6 +14,7 @@ from scipy.ndimage import binary_dilation
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.compiled import njit
 from dvc.deformation.bspline import Table
+from dvc.deformation.interface_spline import Interfaces
 from dvc.images.filters import gaussian, spline_coefficients
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import cubic_at
@@ -51,13 +52,13 @@ class ImagePair:
 
     Components of the displacement, and control points, are along the axes of `fixed`. Normal matrices, gain and strain
     are held by blocks of so many voxels along each axis. Nearer than `rim_mm` to its ends and gaps the moving image is
-    not used: blurred there, it shows what lies beyond. With `factors` at the voxels, as in `SplineSums`, strain is
-    taken at the first voxel of each block, which lies in one tissue; without, at the block's centre.
+    not used: blurred there, it shows what lies beyond. With `interfaces`, strain is taken at the
+    first voxel of each block, which lies in one tissue; without, at the block's centre.
     """
 
     def __init__(
         self, fixed: Image, moving: Image, inside: BoolArray, control: Grid, block: IntArray, rim_mm: float = 0.0,
-        factors: FloatArray | None = None,
+        interfaces: Interfaces | None = None,
     ) -> None:  # fmt: skip
         self.grid, self.block = fixed.grid, block
         missing = fixed.missing
@@ -74,21 +75,22 @@ class ImagePair:
         along = [a + s * np.arange(n) for (a, s, _), n in zip(axes, self.grid.shape, strict=True)]
         self.sums = SplineSums(control, along, self.inside)
         # (ni, nj, nk, splines): what the splines are multiplied by at the voxels
-        self._factors = np.ones((0, 0, 0, 0)) if factors is None else np.ascontiguousarray(factors[..., 0])
+        self._factors = np.ones((0, 0, 0, 0))
         self._first: tuple[slice, ...] | None = None
         compared = self.share(inside) > 0  # a block is, if any voxel of it is: before `_first` is set
-        if factors is None:
+        if interfaces is None:
             counts = zip(axes, compared.shape, strict=True)
             middles = [a + s * ((np.arange(n) + 0.5) * b - 0.5) for (a, s, b), n in counts]
             self.blocks = SplineSums(control, middles, compared)
         else:
             self._first = tuple(slice(None, None, int(b)) for b in block)
             firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
-            self.blocks = SplineSums(control, firsts, compared, factors[self._first])
+            self.blocks = SplineSums(control, firsts, compared, interfaces.at_voxels(compared, block))
+            self._factors = interfaces.at_voxels(self.inside, gradient=False)[..., 0]
         self._carried = np.zeros(self.grid.shape, dtype=np.float32)
 
     def share(self, where: BoolArray) -> FloatArray:
-        """Volume of each block that lies in ``where``, mm3; with factors, all of it where its first voxel does."""
+        """Volume of each block that lies in ``where``, mm3; with interfaces, all of it where its first voxel does."""
         if self._first is not None:
             return np.asarray(where[self._first] * float(np.prod(self.block)) * self.grid.voxel_volume_mm3)
         padded = np.pad(where, [(0, -n % b) for n, b in zip(where.shape, self.block, strict=True)])

@@ -8,6 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.compiled import njit
+from dvc.deformation.interface_spline import Interfaces
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal
@@ -78,13 +79,13 @@ class Level:
 
     def __init__(
         self, images: tuple[Image, Image], inside: BoolArray, soft: BoolArray, stiff: BoolArray, roughness: Roughness,
-        rim_mm: float = 0.0, factors: FloatArray | None = None, rest: FloatArray | None = None,
+        rim_mm: float = 0.0, interfaces: Interfaces | None = None, rest: FloatArray | None = None,
     ) -> None:  # fmt: skip
         self.rest = rest
         grid, control = images[0].grid, roughness.control
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / grid.spacing_mm), 1).astype(np.int64)
         self.control, self.roughness = control, roughness
-        self.pair = ImagePair(*images, inside, control, block, rim_mm, factors)
+        self.pair = ImagePair(*images, inside, control, block, rim_mm, interfaces)
         self._tissue = _share_at(control, soft | stiff, grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0

@@ -112,13 +112,13 @@ class _Stage:
         pictures = brightness_scaled(pair)
         rough = ((1.0, REST), (_BENDING * self.interfaces.reach_mm**2, _SQUARE))
         laplacians = _WITH_JUMPS if pair.labels is None else _LAPLACIANS
-        roughness, factors = Roughness(control, rough, laplacians), self.interfaces.at_voxels()
+        roughness = Roughness(control, rough, laplacians)
         both = None if rest is None else np.concatenate([rest, np.zeros_like(rest)])
         share = np.cumsum(np.count_nonzero(inside, axis=(1, 2))) / max(np.count_nonzero(inside), 1)
         slab = np.zeros_like(inside)  # the middle third of the voxels along the first axis, from skin to skin
         slab[(share > 1.0 / 3.0) & (share <= 2.0 / 3.0)] = True
         self.whole, self.slab = (
-            Level(pictures, inside & part, soft & part, skin & part, roughness, factors=factors, rest=both)
+            Level(pictures, inside & part, soft & part, skin & part, roughness, interfaces=self.interfaces, rest=both)
             for part in (np.ones_like(soft), slab)
         )
         self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & slab).any())

@@ -106,10 +106,16 @@ def test_factors_at_voxels_are_those_at_their_centres(borders):
     """Also on borders, where each voxel has its own side's gradient; along the axes of an oblique grid."""
     turn = Rotation.from_rotvec([20.0, -10.0, 30.0], degrees=True).as_matrix()
     grid = Grid(GRID.shape, GRID.spacing_mm, GRID.origin_mm, turn)
-    oblique = borders_of(LabelMap(grid, layers().labels, NAMES))
-    at_voxels, at_points = oblique.at_voxels(), oblique.at(grid.points().reshape(-1, 3)).reshape(*GRID.shape, 2, 4)
+    oblique, everywhere = borders_of(LabelMap(grid, layers().labels, NAMES)), np.ones(grid.shape, dtype=bool)
+    at_voxels = oblique.at_voxels(everywhere)
+    at_points = oblique.at(grid.points().reshape(-1, 3)).reshape(*GRID.shape, 2, 4)
     np.testing.assert_allclose(at_voxels[..., 0], at_points[..., 0], atol=1e-9)
     np.testing.assert_allclose(at_voxels[..., 1:] @ turn.T, at_points[..., 1:], atol=1e-9)
+    np.testing.assert_array_equal(oblique.at_voxels(everywhere, gradient=False), at_voxels[..., :1])
+    some = np.random.default_rng(8).uniform(size=at_voxels[::2, ::3, ::1].shape[:3]) < 0.5
+    found = oblique.at_voxels(some, (2, 3, 1))
+    np.testing.assert_array_equal(found[some], at_voxels[::2, ::3, ::1][some])
+    assert not found[~some].any()
 
 
 def test_without_bone_nothing_is_held(borders):
@@ -264,7 +270,7 @@ def sums(spline) -> SplineSums:
     at, step = control.indices_of(GRID.origin_mm), GRID.spacing_mm / control.spacing_mm
     along = [a + s * np.arange(n) for a, s, n in zip(at, step, GRID.shape, strict=True)]
     inside = np.random.default_rng(4).uniform(size=GRID.shape) < 0.3
-    return SplineSums(control, along, inside, spline.borders.at_voxels())
+    return SplineSums(control, along, inside, spline.borders.at_voxels(inside))
 
 
 def test_sums_with_factors_are_those_of_the_interface_spline(sums, spline):

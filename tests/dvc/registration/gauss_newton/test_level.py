@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvc.deformation.bspline import BSpline
+from dvc.deformation.interface_spline import Interfaces
 from dvc.deformation.protocol import Affine, evaluate_on_grid
 from dvc.errors import InputError
-from dvc.images.image import Grid, Image
+from dvc.images.image import Grid, Image, LabelMap
 from dvc.registration.gauss_newton.fit import control_grid, spline_through
 from dvc.registration.gauss_newton.image_term import ImagePair
 from dvc.registration.gauss_newton.level import Level, Weights, _share_at, strained
@@ -47,10 +48,9 @@ def test_a_block_is_compared_if_any_voxel_of_it_is(interfaces):
     image = Image(grid, np.random.default_rng(1).uniform(size=grid.shape).astype(np.float32))
     inside = np.ones(grid.shape, dtype=bool)
     inside[2, 4, 6], inside[4:6, 4:6, 4:6] = False, False
-    factors = np.zeros((*grid.shape, 1, 4))
-    factors[..., 0] = 1.0
+    meet = Interfaces.of(LabelMap(grid, np.ones(grid.shape, dtype=int), {1: "fat"}), None, 3.0)
     control = control_grid(grid, np.full(3, 4.0))
-    pair = ImagePair(image, image, inside, control, np.full(3, 2), factors=factors if interfaces else None)
+    pair = ImagePair(image, image, inside, control, np.full(3, 2), interfaces=meet if interfaces else None)
     assert pair.blocks.inside[1, 2, 3]
     assert not pair.blocks.inside[2, 2, 2]
     assert pair.blocks.inside.sum() == 4**3 - 1
