@@ -2,6 +2,7 @@
 
     python -m benchmarks.unforeseen --work FOLDER --out benchmarks/results/unforeseen.json   # hours on one core
     python -m benchmarks.unforeseen --work FOLDER --widen STUDY                              # the models that ship
+    python -m benchmarks.unforeseen --work FOLDER --untouched --out benchmarks/results/untouched.json
 
 A whole phantom heel is meshed, and pressed and sheared by the plate of the published experiment, with another set of
 tissues for each kind of motion. Images of both states are made and registered by each engine. The tables of the shipped
@@ -12,7 +13,8 @@ accuracy study, on a heel that it did not use, are given for comparison. Results
 again, so two processes may share the work (--heels).
 
 With --widen, the error models of an accuracy study (`mrstrain accuracy --out STUDY`) are widened by all kinds of motion
-and written to where mrstrain finds them.
+and written to where mrstrain finds them. Two kinds of motion, on a heel of their own, are never used for that: they are
+registered (--untouched) when everything else is settled, and judged by the error models as they ship.
 """
 
 from __future__ import annotations
@@ -20,13 +22,13 @@ from __future__ import annotations
 import argparse
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from benchmarks.hidden_law import BONES, as_motion, truth
 from dvc import (
@@ -39,6 +41,7 @@ from dvc import (
     register,
     write_labels,
 )
+from dvc.arrays import FloatArray
 from dvc.trust.error_model import error_model_of
 from dvc.worker import Worker
 from fe import read_tet_mesh, write_tet_mesh
@@ -63,7 +66,7 @@ from phantoms import (
 )
 from validate import read_result
 
-ENGINES = ("gauss-newton-borders", "gauss-newton")
+ENGINES = ("gauss-newton-borders", "gauss-newton-bone", "gauss-newton")
 VOXEL_MM, SNR = (0.8, 0.8, 0.8), 25.0
 COARSE_MM = (1.2, 1.2, 1.2)
 NEAR_MM = 3.0
@@ -93,6 +96,11 @@ KINDS = {
     "slipping": (9300, laws(10.0, (0.12, 0.9), 14.0)),
     "stiff-muscle": (9300, laws(6.0, (0.2, 1.0), 40.0)),
 }
+# Never used to widen an error model. Fat of "layers" is stiff near the skin and soft near the bone, as in a real heel;
+# the plate of "oblique" is tilted by 20 degrees, and shears sideways.
+UNTOUCHED = {"layers": (9302, laws((20.0, 6.0), (0.2, 1.0), 14.0)), "oblique": (9302, "erdemir")}
+OBLIQUE = {"plate_normal": (0.0, -np.sin(np.pi / 9), -np.cos(np.pi / 9)), "shear_direction": (1.0, 0.0, 0.0)}
+STIFF_LAYER_MM = 5.0
 PRESSED, SHEARED = "Load1", "Load3"
 
 
@@ -107,9 +115,16 @@ def cases(engine: str) -> Iterator[AccuracyCase]:
         yield AccuracyCase(engine, VOXEL_MM, SNR, motion, 9300)
 
 
+def untouched(engine: str) -> Iterator[AccuracyCase]:
+    """Every case of an engine on motions that no error model may see."""
+    for kind, (heel, _) in UNTOUCHED.items():
+        for load in (PRESSED, SHEARED):
+            yield AccuracyCase(engine, VOXEL_MM, SNR, f"{kind}-{load}", heel)
+
+
 def simulated(work: Path, kind: str) -> tuple[Path, LabelMap]:
     """Simulate a kind of motion, if that is not done; the folder of its results, and the label map that was meshed."""
-    heel, material = KINDS[kind]
+    heel, material = (KINDS | UNTOUCHED)[kind]
     labels = labels_of(Heel(heel), heel_grid(VOXEL_MM))
     place, own = work / f"{heel}-{kind}", "\n" in material
     folder = place / ("hidden" if own else material)
@@ -122,27 +137,42 @@ def simulated(work: Path, kind: str) -> tuple[Path, LabelMap]:
         make_mesh(work / f"whole{heel}.nii.gz", out=mesh, edge_mm=3.6, names=names, bones=BONES)
     place.mkdir(exist_ok=True)
     if "fat-1" in material:
-        mesh = mixed(mesh, place / "mixed.vtu", labels, heel)
+        divide = layered if kind == "layers" else mixed
+        mesh = divided(mesh, place / "mixed.vtu", lambda at: divide(at, labels, heel))
     if own:
         (place / "hidden.toml").write_text(material)
     loads = [load for load in LOADS if load.name == PRESSED or (load.name == SHEARED and kind != "slipping")]
     sets = [str(place / "hidden.toml") if own else material]
-    print(*simulate(mesh, out=place, sets=sets, loads=loads, taped=kind != "slipping").summary(), sep="\n", flush=True)
+    plate = {"taped": kind != "slipping"} | (OBLIQUE if kind == "oblique" else {})
+    print(*simulate(mesh, out=place, sets=sets, loads=loads, **plate).summary(), sep="\n", flush=True)
     return folder, labels
 
 
-def mixed(mesh: Path, out: Path, labels: LabelMap, seed: int) -> Path:
-    """The mesh with three kinds of fat, in lobules of 6 mm."""
+def divided(mesh: Path, out: Path, kind_of: Callable[[FloatArray], FloatArray]) -> Path:
+    """The mesh with several kinds of fat, by the kind (0, 1 ...) of the positions (n, 3), LPS mm, of its cells."""
     plain = read_tet_mesh(mesh)
-    fat, width = plain.regions["fat"], 6.0 / 2.355 / VOXEL_MM[0]
-    shape = [n + int(np.ceil(6.0 * width)) for n in labels.grid.shape]
-    values = gaussian_filter(np.random.default_rng([seed, 77]).standard_normal(shape), width, mode="wrap")
-    at = np.rint(labels.grid.indices_of(plain.centroids_mm[fat])).astype(int)
-    kinds = np.digitize(values[tuple(at.T)], np.quantile(values[tuple(at.T)], [1 / 3, 2 / 3]))
+    fat = plain.regions["fat"]
+    kinds = kind_of(plain.centroids_mm[fat])
     regions = {name: cells for name, cells in plain.regions.items() if name != "fat"}
-    regions |= {f"fat-{k}": fat[kinds == k] for k in range(3)}
+    regions |= {f"fat-{k}": fat[kinds == k] for k in np.unique(kinds)}
     write_tet_mesh(out, TetMesh(plain.points_mm, plain.cells, regions=regions, facets=plain.facets), {})
     return out
+
+
+def mixed(points_mm: FloatArray, labels: LabelMap, seed: int) -> FloatArray:
+    """Three kinds of fat, in lobules of 6 mm."""
+    width = 6.0 / 2.355 / VOXEL_MM[0]
+    shape = [n + int(np.ceil(6.0 * width)) for n in labels.grid.shape]
+    values = gaussian_filter(np.random.default_rng([seed, 77]).standard_normal(shape), width, mode="wrap")
+    at = np.rint(labels.grid.indices_of(points_mm)).astype(int)
+    return np.asarray(np.digitize(values[tuple(at.T)], np.quantile(values[tuple(at.T)], [1 / 3, 2 / 3])))
+
+
+def layered(points_mm: FloatArray, labels: LabelMap, _seed: int) -> FloatArray:
+    """Two kinds of fat: that within some millimetres of the skin, and that below."""
+    from_skin = distance_transform_edt(~labels.region("skin").inside, sampling=labels.grid.spacing_mm)
+    at = np.rint(labels.grid.indices_of(points_mm)).astype(int)
+    return np.asarray(from_skin[tuple(at.T)] > STIFF_LAYER_MM, dtype=float)
 
 
 def modelled(work: Path, case: AccuracyCase, worker: Worker) -> ErrorSamples:
@@ -171,7 +201,7 @@ def run(work: Path, of: list[AccuracyCase]) -> None:
         for case in of:
             path = work / "runs" / f"{case.name}.npz"
             if ErrorSamples.read(path, key) is None:
-                if case.kind in KINDS:
+                if case.kind in KINDS | UNTOUCHED:
                     one = modelled(work, case, worker)
                 else:
                     one = measure_run(case, worker, nullcontext(), lambda _: None)
@@ -191,8 +221,8 @@ def told(one: ErrorSamples) -> dict[str, float]:
     return {t: round(float(np.sqrt(np.mean(error[one.tissue == numbers[t]] ** 2))), 4) for t in SOFT}
 
 
-def held(runs: list[ErrorSamples], model: ErrorModel) -> dict[str, dict[str, float]]:
-    """Share of voxels and of figures in their intervals, and half the width of voxels' intervals, by kind of motion."""
+def held(runs: list[ErrorSamples], model: ErrorModel, figures: list[CoverageRow]) -> dict[str, dict[str, float]]:
+    """Share of voxels and of ``figures`` in their intervals, and half the width of voxels', by kind of motion."""
     numbers = {name: number for number, name in TISSUES.items()}
     found: dict[str, dict[str, list[np.ndarray]]] = {}
     for one in runs:
@@ -208,9 +238,7 @@ def held(runs: list[ErrorSamples], model: ErrorModel) -> dict[str, dict[str, flo
             rows.setdefault("near bone", []).append(within[one.to_bone_mm[of] < NEAR_MM])
     shares = {kind: {t: round(float(np.concatenate(w).mean()), 3) for t, w in of.items()} for kind, of in found.items()}
     each: dict[tuple[str, str], list[float]] = {}
-    for row in [row for kind in KINDS for row in left_out(runs, kind, model)] + coverage_rows(
-        [one for one in runs if one.case.kind not in KINDS], model
-    ):
+    for row in figures:
         case = AccuracyCase("", VOXEL_MM, SNR, row.motion, 0)
         kind = f"{case.kind}{' at 1.2 mm' if row.voxel_mm == '1.2' else ''}"
         of_row = {"figures": row.statistics_within, "normal strain": row.normal_strain_within}
@@ -223,42 +251,57 @@ def held(runs: list[ErrorSamples], model: ErrorModel) -> dict[str, dict[str, flo
     return {"every kind": means} | shares
 
 
+def figures_of(runs: list[ErrorSamples], model: ErrorModel) -> list[CoverageRow]:
+    """Coverage of figures: each kind with intervals widened by the other kinds, the rest with those of the model."""
+    by_kind = [row for kind in KINDS for row in left_out(runs, kind, model)]
+    return by_kind + coverage_rows([one for one in runs if one.case.kind not in KINDS], model)
+
+
 def left_out(runs: list[ErrorSamples], kind: str, model: ErrorModel) -> list[CoverageRow]:
     """Coverage of a kind of motion, with intervals widened by the other kinds."""
     others = [one for one in runs if one.case.kind in KINDS and one.case.kind != kind]
     return coverage_rows([one for one in runs if one.case.kind == kind], widened_for(model, others))
 
 
-def ship(work: Path, study: Path) -> None:
+def ship(work: Path, study: Path, engines: Iterable[str]) -> None:
     """Widen the error models of a study, and write them to where mrstrain finds them."""
-    for engine in ENGINES:
-        made = (ErrorSamples.read(work / "runs" / f"{case.name}.npz", key) for case in cases(engine))
-        some = [one for one in made if one is not None and one.case.kind in KINDS]
+    for engine in engines:
+        some = [one for one in measured(work, cases(engine)) if one.case.kind in KINDS]
         model = widened_for(read_error_model(study / f"error_model_{engine}.json"), some)
         source = f"{model.source}; intervals of tissues widened by {len(some)} pairs that finite-element models move"
         replace(model, source=source).write(Path(f"dvc/trust/error_models/{engine}.json"))
+
+
+def measured(work: Path, of: Iterable[AccuracyCase]) -> list[ErrorSamples]:
+    """Samples of those cases that were measured."""
+    read = (ErrorSamples.read(work / "runs" / f"{case.name}.npz", key) for case in of)
+    return [one for one in read if one is not None]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--heels", type=int, nargs="+", help="only make the pairs of these heels")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=ENGINES)
+    parser.add_argument("--untouched", action="store_true", help="the motions that no error model may see")
+    parser.add_argument("--out", type=Path, help="results of other engines in this file are kept")
     parser.add_argument("--widen", type=Path, help="folder of an accuracy study")
     given = parser.parse_args()
     (given.work / "runs").mkdir(parents=True, exist_ok=True)
-    both = [case for engine in ENGINES for case in cases(engine)]
-    run(given.work, [case for case in both if given.heels is None or case.seed in given.heels])
+    of = untouched if given.untouched else cases
+    every = [case for engine in given.engines for case in of(engine)]
+    run(given.work, [case for case in every if given.heels is None or case.seed in given.heels])
     if given.widen is not None:
-        ship(given.work, given.widen)
+        ship(given.work, given.widen, given.engines)
     if given.out is None:
         return
-    result: dict[str, object] = {"versions": versions()}
-    for engine in ENGINES:
-        made = [ErrorSamples.read(given.work / "runs" / f"{case.name}.npz", key) for case in cases(engine)]
-        model = error_model_of(engine)
+    result = json.loads(given.out.read_text()) if given.out.is_file() else {}
+    result["versions"] = versions()
+    for engine in given.engines:
+        runs, model = measured(given.work, of(engine)), error_model_of(engine)
         assert model is not None
-        result[engine] = held([one for one in made if one is not None], model)
+        figures = coverage_rows(runs, model) if given.untouched else figures_of(runs, model)
+        result[engine] = held(runs, model, figures)
         print(engine, json.dumps(result[engine], indent=1))
     given.out.write_text(json.dumps(result, indent=1) + "\n")
 
