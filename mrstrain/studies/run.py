@@ -12,7 +12,7 @@ from dvc import Verdict
 from dvc.errors import InputError, ParameterError, few
 from dvc.io.result_folder import REPORT
 from dvc.memory import hand_memory_back
-from mrstrain.options.measurement import in_parallel
+from mrstrain.options.measurement import in_parallel, refuse_misspelt_auto
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.log import append, timed
 from mrstrain.records.progress import ALL, OnProgress
@@ -197,6 +197,8 @@ def _planned(
         refuse_unknown(stages, only, force)
     files = dict.fromkeys(path for stages in planned.values() for stage in stages for path in stage.files)
     if missing := [path for path in files if not path.exists()]:
+        for study in studies.values():
+            refuse_misspelt_auto(study.images.labels, study.place)
         raise InputError("These files of the study do not exist:\n" + "\n".join(f"  {path}" for path in missing))
     pipelines = {
         name: Pipeline(planned[name], Ledger(study.out, study.place), only=only, force=force)
