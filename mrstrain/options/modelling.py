@@ -89,8 +89,8 @@ class Directions(Options):
     """Direction of the shear force on the tissue, LPS. Default: 0 -1 0 (anterior)."""
 
     def assumed(self, instead: str) -> str:
-        """A sentence if the plate lies where it does by default, with what to give ``instead``; empty otherwise."""
-        if self.plate_normal != INFERIOR:
+        """A sentence if nobody said where the plate lies, with what to give ``instead``; empty otherwise."""
+        if "plate_normal" in self.model_fields_set:
             return ""
         return f"The plate is taken to be inferior to the body (normal 0 0 -1, LPS). If it lies elsewhere, {instead}."
 
