@@ -131,6 +131,11 @@ class Plate(modelling.PlateOptions):
     plate_normal: Vector = Field(default=modelling.INFERIOR, validation_alias="normal")
     """Direction from the body to the plate, LPS (x left, y posterior, z superior)."""
 
+    @property
+    def is_placed(self) -> bool:
+        """Whether the plate lies elsewhere than `init` writes for everyone."""
+        return self.plate_normal != modelling.INFERIOR
+
 
 class Registering(RegistrationOptions):
     """Options of the registration, as those of `register`."""
