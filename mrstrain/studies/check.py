@@ -296,8 +296,10 @@ class _Look:
             there, bones = np.unique(labels.labels), bones_of(labels, self.study.mesh.bones)
             names = [name for n, name in labels.names.items() if n != 0 and n in there]
         soft = [name for name in names if name not in bones]
+        if_there = "" if labels is not None else ", if the label map that is made has it,"
         self.warnings += [
-            f"{name} will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] bones."
+            f"{name}{if_there} will be meshed as soft tissue, but has the name of a bone. "
+            "If it is one, add it to [mesh] bones."
             for name in soft
             if warned and is_bones_name(name)
         ]
