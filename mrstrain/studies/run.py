@@ -16,7 +16,7 @@ from mrstrain.options.measurement import in_parallel, refuse_misspelt_auto
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.log import append, timed
 from mrstrain.records.progress import ALL, OnProgress
-from mrstrain.records.time_left import TimeLeft, seconds_to_end
+from mrstrain.records.time_left import Expected, seconds_to_end
 from mrstrain.studies.check import wrong_with
 from mrstrain.studies.costs import costs, disk_bytes, expected, gib_of, sizes_of
 from mrstrain.studies.file import Study, read_study
@@ -139,11 +139,8 @@ def run_studies(
     pipelines, to_do = _planned(named, only, force)
     at_once, follower = in_parallel(workers), follower or Follower()
     reports = {prefix: Report(study, pipelines[prefix], follower.on_report) for prefix, study in named.items()}
-    # What was done before tells how fast this machine is.
-    expectations = {name: one for name, (one, _) in follower.before.items()}
-    took = {name: taken_s for name, (_, taken_s) in follower.before.items()}
-    left_of_all = TimeLeft(expectations, at_once, began=dict.fromkeys(took, follower.began), took=took)
-    watch = Watch(follower, reports, left_of_all)
+    expectations: dict[str, Expected] = {}
+    watch = Watch(follower, reports, follower.time_left({}, at_once))
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
@@ -169,6 +166,7 @@ def run_studies(
                 pipelines[prefix].gib = {stage.name: gib_of(stage, study, voxels, cells) for stage in left}
                 if scheduler is None:
                     _tell(*costs(study, stages, left, voxels, cells, at_once), log)
+        watch.left = follower.time_left(expectations, at_once)
         hand_memory_back()  # of the images that were checked
         with watch.reporting():
             run_all(pipelines, pool, logs, watch.ended)

@@ -35,6 +35,12 @@ class Follower:
     began: float = field(default_factory=time.monotonic)  # when the whole work began
     before: Mapping[str, tuple[Expected, float]] = field(default_factory=dict)  # done before the run, and seconds taken
 
+    def time_left(self, expected: Mapping[str, Expected], workers: int) -> TimeLeft:
+        """The time left of stages; what was done before tells how fast this machine is."""
+        took = {name: taken_s for name, (_, taken_s) in self.before.items()}
+        done = {name: one for name, (one, _) in self.before.items()}
+        return TimeLeft(done | dict(expected), workers, began=dict.fromkeys(took, self.began), took=took)
+
 
 @dataclass(slots=True, eq=False)
 class Report:

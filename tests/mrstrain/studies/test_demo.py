@@ -16,7 +16,7 @@ from dvc.errors import InputError, OutputError
 from dvc.report.page import Section
 from dvc.trust.verdict import Verdict
 from mrstrain.models.simulate import LOADS
-from mrstrain.records.time_left import Expected, Pace, TimeLeft
+from mrstrain.records.time_left import Expected, Pace
 from mrstrain.studies.demo import _make, _reached, _summary
 from mrstrain.studies.file import read_study
 from mrstrain.studies.ledger import StageRecord
@@ -25,6 +25,7 @@ from mrstrain.studies.plan import plan
 from mrstrain.studies.run import StudyRun, run_studies
 from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import read_errors, write_errors
+from mrstrain.studies.watch import Follower
 from mrstrain.truth.phantom import phantom
 from phantoms import Heel, TissueError, under_load
 from tests.processes import stages_run_here
@@ -219,8 +220,7 @@ def _told_over_true(phantom_s: int, study_s: int, monkeypatch) -> list[float]:
         if clock[0] >= 0.1 * (phantom_s + study_s):
             ratios.append(clock[0] * (1.0 / shares[-1] - 1.0) / (phantom_s + study_s - clock[0]))
     assert len(ratios) > 3
-    ((expected, taken_s),) = making.done.values()
+    ((_, taken_s),) = making.done.values()
     assert taken_s == phantom_s
-    stages = {"phantom": expected, "study": Expected(150.0)}  # what `costs` expects of it
-    begun = TimeLeft(stages, 1, began={"phantom": 0.0}, took={"phantom": taken_s})
+    begun = Follower(before=making.done).time_left({"study": Expected(150.0)}, 1)  # what `costs` expects of it
     return [*ratios, begun.seconds() / study_s]
