@@ -30,11 +30,12 @@ from dvc.report.strips import Strip
 from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, report, tables
-from validate.agreement import Agreement, SkinDisplacement
+from validate.agreement import Agreement, SkinDisplacement, regression_told
 from validate.comparison_error import ComparisonError
 from validate.curves import Area, range_told
 from validate.decomposition import Representation
 from validate.extrapolation import LEVELLED
+from validate.limitations import limitations
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
 from validate.location import Overlap
 from validate.mapping import ALL
@@ -43,8 +44,6 @@ from validate.misfit import Misfit, check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import Drawn, area_rows, closing_sections, drawings_of_all, load_sections, overview, shown
 from validate.tables import Curve
-
-_COVERED = 0.9  # fraction of the mesh; a model that covers less is noted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +92,7 @@ class Comparison:
     errors: tuple[ComparisonError, ...] = ()
 
     def summary(self) -> list[str]:
-        """Verdict, areas, and significant differences, one line each."""
+        """Verdict, areas, best match, its slope and R², and significant differences, one line each."""
         lines = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}"]
         for load in self.coverage_ml:
             areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL)}
@@ -111,7 +110,7 @@ class Comparison:
             informative = ALL_LOADS not in self.ranking.uninformative
             listed = _listed(self.ranking.areas, self.ranking.nothing, informative)
             lines.append(f"All loads, area in mL{'' if informative else ' (not informative)'}: {listed}")
-        return [*lines, *self.ranking.statements, *self.notes]
+        return [*lines, *self.statements, *self.notes]
 
     def __str__(self) -> str:
         return "\n".join(self.summary())
@@ -128,12 +127,24 @@ class Comparison:
         return notebook_html(self.headline, picture, Table(title, head, rows), notes=words)
 
     @property
+    def statements(self) -> tuple[str, ...]:
+        """Those of the ranking; after the first, slope and R² of the best match, cell by cell."""
+        first, rest = self.ranking.statements[:1], self.ranking.statements[1:]
+        told = regression_told(self.agreements, self._best.model)
+        return (*first, *([told] if told else []), *rest)
+
+    @property
+    def _best(self) -> Area:
+        """The smallest area over all loads; under any load, if no model has every load."""
+        ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
+        return min(ranked, key=lambda a: (a.levelled, a.best_ml))
+
+    @property
     def headline(self) -> str:
         """One sentence: the best match, or the area of a single model."""
         if best_match := next((line for line in self.ranking.statements if line.startswith("Best match")), None):
             return best_match
-        ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
-        best = min(ranked, key=lambda a: a.best_ml)
+        best = self._best
         nothing = {a.load: a for a in (*self.areas, self.ranking.nothing) if (a.model, a.tissue) == (NOTHING, ALL)}
         worse = ", no better than a model without deformation" if no_nearer([best], nothing[best.load]) else ""
         return f"{best.model}: {self._area} {shown(best)} mL ({best.load}), normalised {100 * best.share:.1f} %{worse}."
@@ -204,7 +215,7 @@ class Comparison:
         parts, strips = zip(*each(write_one, self.loads), strict=True)
         of_all = drawings_of_all(strips, self.curves, self.strains, self.ranking, ends)
         pictures = [drawing.save(target / stem) for stem, drawing in of_all.items()]
-        first = overview(self.loads, self.ranking, self.warnings, notes, pictures)
+        first = overview(self.loads, self.ranking, self.warnings, (*self.statements, *notes), pictures)
         sections = [first, *(section for part in parts for section in part)]
         known = {load: of for load, of in self.verdicts.items() if of is not None}
         levels = {load: of.level for load, of in known.items()}
@@ -329,7 +340,7 @@ def compare(
         model_forms=tuple(m for one in loads for m in one.model_forms),
         curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
         ranking=rank_over_loads(loads, odd), strains=by.strains, coverage_ml=coverage,
-        verdict=verdict, verdicts=verdicts, notes=(*notes, *_doubts(verdict), *_limitations(loads)),
+        verdict=verdict, verdicts=verdicts, notes=(*notes, *_doubts(verdict), *limitations(loads)),
         warnings=tuple(odd), loads=tuple(loads), errors=tuple(error for one in loads for error in one.errors),
     )  # fmt: skip
 
@@ -355,35 +366,6 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[Misfit
 def _doubts(verdict: Verdict | None) -> tuple[str, ...]:
     """Reasons of a verdict below trust."""
     return () if verdict is None or verdict.level == "trust" else verdict.reasons
-
-
-def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
-    """Limitations of each measurement, and models that cover little of the mesh, as sentences."""
-    notes = []
-    for one in loads:
-        load, error, volumes = one.load, one.case.error, one.fields.coverage()
-        if one.case.aligned_on == "none":
-            what = "the rigid motion of the bone was not removed from this measurement, so displacements include it."
-            notes.append(f"{load}: {what}")
-        if gaps := ", ".join(one.case.without_intervals):
-            notes.append(f"{load}: no intervals in {gaps}; the measurement gives the reason.")
-        if error is not None and np.isnan(error.widening):
-            what = "the error model is from one motion of one subject, so the coverage of its intervals is unknown."
-            notes.append(f"{load}: {what}")
-        notes += [
-            f"{load}: {name} covers only {100 * volumes[name] / volumes['mesh']:.0f} % of the mesh. All models are "
-            "compared on the tissue that every model covers."
-            for name in one.fields.models
-            if volumes[name] < _COVERED * volumes["mesh"]
-        ]
-    if unknown := ", ".join(one.load for one in loads if one.case.error is None):
-        what = "the measurement has no error model, so its uncertainty is unknown"
-        if not loads[0].bones:
-            what = "the error model needs the distance to bone, so the measurement uncertainty is unknown"
-            soft = ", ".join(loads[0].labels.names.values())
-            notes.append(f"The label map has no bone; all of its labels ({soft}) are compared as soft tissue.")
-        notes.append(f"{unknown}: {what} and no difference is significant.")
-    return notes
 
 
 def _listed(areas: Sequence[Area], nothing: Area, informative: bool) -> str:

@@ -17,7 +17,7 @@ from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volu
 from dvc.report.strips import MEASURED, Strip, narrow_by_load, strain_by_load
 from dvc.trust.verdict import together
 from validate import figures, standards
-from validate.agreement import Agreement, SkinDisplacement
+from validate.agreement import Agreement, SkinDisplacement, over_loads
 from validate.comparison_error import validation_section
 from validate.curves import Area
 from validate.fe_result import FeResult
@@ -207,15 +207,13 @@ def drawings_of_all(
 
 
 def overview(
-    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[Misfit], notes: Sequence[str],
+    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[Misfit], told: Sequence[str],
     pictures: Sequence[Picture],
 ) -> Section:  # fmt: skip
-    """The first part of the report: best match, figures, areas, and ``warnings`` about models."""
+    """The first part of the report: what is ``told`` in sentences, figures, areas, and ``warnings`` about models."""
     slips = together(odd.verdict for odd in warnings) if warnings else None
     areas = (_areas(loads, ranking),)
-    return Section(
-        "Models and loads", slips, areas, tuple(pictures), (*alike(ranking.statements), *notes), pictures_first=True
-    )
+    return Section("Models and loads", slips, areas, tuple(pictures), alike(told), pictures_first=True)
 
 
 def _head(one: LoadComparison) -> str:
@@ -263,18 +261,23 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
     *rows, nothing = area_rows(
         [a for one in loads for a in one.areas], ranking, [ALL_LOADS, *(one.load for one in loads)]
     )
+    of_all = [row for one in loads for row in one.agreements]
+    followed = [[over_loads(of_all, row[0], "max_shear", value) or "–" for value in ("slope", "r2")] for row in rows]
     return Table(
         f"Area between measured and simulated strain-volume curves, all soft tissue, strain {low:g} to {high:g}, mL",
-        ("model", "rank", ALL_LOADS, *(_head(one) for one in loads)),
-        tuple(rows),
+        ("model", "rank", ALL_LOADS, *(_head(one) for one in loads), "slope", "R²"),
+        tuple((*row, *of_model) for row, of_model in zip(rows, followed, strict=True)),
         "Best model over all loads first; a rank such as 1–2 means that models are not distinguishable. If the "
         "measurement uncertainty is known, areas are estimates with noise and smoothing removed, with 95 % intervals. "
         "Areas as measured and areas by tissue are given below and in areas.csv."
         + " The sum over all loads includes those that are not informative." * bool(ranking.uninformative)
         + " Models of a forward-model comparison are last, with their area as measured." * levelled
+        + " Slope and R² (range over the loads): regression of the model's maximum shear strain on the measured one, "
+        "cell by cell. Slope: simulated change per unit of measured change; R²: fraction of the simulated variation "
+        "that follows the measurement. Measurement noise lowers both."
         + " Last row: a model that predicts zero strain everywhere; models whose area is no smaller are marked.",
-        (nothing,),
-    )
+        ((*nothing, "–", "–"),),
+    )  # fmt: skip
 
 
 def _tissues(one: LoadComparison) -> Table:

@@ -1,6 +1,7 @@
 """The loads of one subject side by side: the first figure of a report on measurements alone."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,24 +64,28 @@ def on_one_scale(sections: Sequence[Section], subject: Subject, folders: Mapping
     """Sections of loads whose pictures of the strain all have the colours of `shared_scale`, drawn anew where not.
 
     ``folders`` are those of the loads, by the sections' titles; a repeat scan has the colours of the loads. A picture
-    stays if its files are missing or damaged.
+    stays if its files are missing or damaged; the others share the scale of those that can be read.
     """
-    loads = [folder for folder in folders.values() if folder.name != REPEAT]
-    if not loads:
+    scales = list[float]()
+    for folder in folders.values():
+        with suppress(MrstrainError):
+            scales += [] if folder.name == REPEAT else [shared_scale([folder])]
+    if not scales:
         return list(sections)
-    try:
-        scale = shared_scale(loads)
-        return [_on_scale(one, subject, folders[one.title], scale) if one.title in folders else one for one in sections]
-    except MrstrainError:
-        return list(sections)
+    scale = max(scales)
+    return [_on_scale(one, subject, folders[one.title], scale) if one.title in folders else one for one in sections]
 
 
 def _on_scale(section: Section, subject: Subject, folder: Path, scale: float) -> Section:
-    shear = read_scalar(folder / MAX_SHEAR, subject.reference.grid).values
-    if shear_scale(shear) == scale:
+    try:
+        shear = read_scalar(folder / MAX_SHEAR, subject.reference.grid).values
+        if shear_scale(shear) == scale:
+            return section
+        registered = folder / REGISTERED
+        under = read_scalar(registered, subject.reference.grid) if registered.is_file() else None
+    except MrstrainError:
         return section
-    body, registered = subject.body(), folder / REGISTERED
-    under = read_scalar(registered, subject.reference.grid) if registered.is_file() else None
+    body = subject.body()
     view = View.through(subject.reference.grid, subject.lowest_bone_point_mm, np.isfinite(shear))
     loaded = "repeat" if folder.name == REPEAT else "loaded"
     drawing = strain_drawing(view, subject, subject.regions(body), shear, under, loaded=loaded, shared=scale)

@@ -76,7 +76,7 @@ class ModelFacts:
         return cls(
             name, "simulated", {str(region): str(law["law"]) for region, law in given["laws"].items()},
             title=str(given["title"]), element=str(given["element"]).partition(":")[0],
-            mesh="" if not made else f"made from the label map with edges of {made['edge_mm']:g} mm",
+            mesh="" if not made else f"made from the label map, requested edge length {made['edge_mm']:g} mm",
             steps=tuple(LoadStep(**step) for path in given["paths"] for step in path),
             reached={load: float(of["reached"]) for load, of in record["outcome"].items()},
         )  # fmt: skip

@@ -1,12 +1,12 @@
 """The first part of a report on measurements: the strain of every load in one slice, and by tissue in a table."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from dvc import Subject
+from dvc import Subject, Verdict
 from dvc.errors import InputError
 from dvc.images.bone_names import is_bones_name
 from dvc.io.result_folder import QUALITY
@@ -46,7 +46,8 @@ def measured_strain(
 ) -> list[Section]:
     """The first part of a report, from the sections of the loads; its figure is also written into ``out``.
 
-    ``folders`` are those of the loads' results, by load; empty if there is none, and so nothing to show.
+    ``folders`` are those of the loads' results, by load; empty if there is none. `most_strained` is
+    told by the banner of the report, or else by its first paragraph.
     """
     if not folders:
         return []
@@ -55,49 +56,44 @@ def measured_strain(
     picture = measured_by_load(subject, folders).save(out / FIGURE)
     table = table_of_loads(measured)
     tables = () if table is None else (table,)
-    words = most_strained(table, MeasuredBeside.of(folders))
-    return [Section("Measured strain", None, tables, (picture,), words, pictures_first=True)]
+    return [Section("Measured strain", None, tables, (picture,), pictures_first=True)]
 
 
-def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) -> tuple[str, ...]:
-    """A sentence on the most strained tissue of a table of `table_of_loads`; none without a table.
+def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) -> str:
+    """The strain of the most strained tissue of a table of `table_of_loads`, in sentences; empty without a table.
 
     It is the one with the largest 95th percentile of those whose interval begins within 10 % of the highest beginning:
     a tissue of few voxels may have a larger percentile by chance.
     """
     known = _known(table)
     if not known:
-        return ()
+        return ""
     high, (load, tissue, median, *_) = _most(known)
     under = f"{load} ({beside.forces[str(load)]})" if str(load) in beside.forces else str(load)
-    several = len({row[1] for _, row in known}) > 1
-    told = (
-        f"The most strained tissue is {tissue} under {under}"
-        if several
-        else f"{str(tissue).capitalize()} under {under}"
-    )
-    told += f": measured maximum shear strain {median} in the median and {high} at the 95th percentile"
+    of = f"{tissue}, the most strained tissue," if len({row[1] for _, row in known}) > 1 else str(tissue)
+    told = f"Maximum shear strain in {of} under {under}: median {median}, 95th percentile {high}"
     told += "." if high.interval is None else ", with 95 % intervals in brackets."
     overlapping = [str(row[1]) for other, row in known if row[0] == load and row[1] != tissue and other.reaches(high)]
     if overlapping and high.interval is not None:
         told += f" It may be as large in {' and '.join(overlapping)}, as the intervals overlap."
     if beside.floor is not None:
         told += f" The noise floor is {beside.floor.max_shear_p50:.3f} and {beside.floor.max_shear_p95:.3f}."
-    return (told,)
+    return told
 
 
-def in_short(sections: Sequence[Section]) -> str:
-    """The strain of the most strained tissue, for the banner of a report that begins with a table of `table_of_loads`.
+def told_once(
+    sections: Sequence[Section], verdict: Verdict | None, beside: MeasuredBeside = NOTHING_BESIDE
+) -> tuple[str, list[Section]]:
+    """`most_strained` for the banner of a report, and its sections; or "", and these with it as first paragraph.
 
-    Empty without such a table.
+    The banner tells no strain that is not to be trusted, and there is none without a verdict. The first section has the
+    table of `table_of_loads`; without it, there is nothing to tell.
     """
-    known = _known(next((table for table in sections[0].tables if table.title == _TITLE), None)) if sections else []
-    if not known:
-        return ""
-    high, (load, tissue, median, *_) = _most(known)
-    most = " (most strained)" if len(known) > 1 else ""
-    told = f"Maximum shear strain in {tissue} under {load}{most}: median {median}, 95th percentile {high}"
-    return f"{told}{'' if high.interval is None else ', with 95 % intervals'}."
+    first, *others = sections or [Section("")]
+    told = most_strained(next((table for table in first.tables if table.title == _TITLE), None), beside)
+    if not told or (verdict is not None and verdict.level != "distrust"):
+        return told, list(sections)
+    return "", [replace(first, paragraphs=(told, *first.paragraphs)), *others]
 
 
 _Strained = tuple[Estimate, tuple[Cell, ...]]

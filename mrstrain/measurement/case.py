@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Self
 import dvc
 from dvc import Verdict
 from dvc.atomic_files import write_json
-from dvc.io.result_folder import PROVENANCE, REPORT
+from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
 from dvc.report.page import Section, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.measurement.acquisition import acquisition_section
-from mrstrain.measurement.answer import in_short
+from mrstrain.measurement.answer import MeasuredBeside, told_once
 
 if TYPE_CHECKING:  # it draws, and matplotlib takes half a second: `Plan.register` loads it meanwhile
     from dvc import Measurement
@@ -108,13 +108,16 @@ class Series:
         told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]
         verdict = worst([s.verdict.among(s.title) if told[1:] else s.verdict for s in told if s.verdict is not None])
         write_json(out / PROVENANCE, record)
+        folders = {case.name: case.folder for case in cases}
+        beside = MeasuredBeside.of({name: folder for name, folder in folders.items() if name != REPEAT})
+        short, first = told_once(first, verdict, beside)
         told = [*first, *(replace(section, folded=bool(first)) for section in told)]
         told += [replace(section, folded=True) for section in more]
-        acquired = acquisition_section({case.name: case.folder for case in cases})
+        acquired = acquisition_section(folders)
         told += [] if acquired is None else [acquired]
         closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
         title, notes = "Strain from MR image pairs", [*_images(record, cases), *([] if advice is None else [advice])]
-        lines, short = record_lines(record), in_short(first)
+        lines = record_lines(record)
         write_report(out / REPORT, title, verdict, told, closing, lines, answer=short, notes=notes)
         return cls(out, cases, failures, advice)
 

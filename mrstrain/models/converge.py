@@ -133,7 +133,7 @@ def converge(
         for edge, place in places.items():
             made = simulate.with_options(
                 place, out=target / f"simulated-{edge:g}", simulation=options.SimulationOptions(sets=(material,)),
-                loads=loads, plate_options=options.PlateOptions(**dict(directions)),
+                loads=loads, plate_options=options.PlateOptions(**directions.model_dump(exclude_unset=True)),
                 coordinates=options.MeshCoordinates(), cores=Cores(workers=workers),
                 progress=lambda case, stage, share, edge=edge: tell(f"{edge:g} mm, {case}", stage, share),  # type: ignore[misc]
             )  # fmt: skip

@@ -32,14 +32,17 @@ class Meshed:
     out: Path
     mesh: TetMesh
     quality: MeshQuality
+    asked: Meshing
 
     def summary(self) -> list[str]:
         """Summary, a few lines."""
         q = self.quality
         volumes = ", ".join(f"{name} {made:.1f} ({kept:.1f})" for name, made, kept in q.volumes_ml)
         low, middle, high = q.edge_mm
+        finer = "" if self.asked.finer is None else " ({1:g} mm in {0})".format(*self.asked.finer)
         lines = [
-            f"{q.cells} tetrahedra, {q.nodes} nodes; edges {middle:.2f} mm ({low:.2f} to {high:.2f}), dihedral angles "
+            f"{q.cells} tetrahedra, {q.nodes} nodes; requested edge length {self.asked.edge_mm:g} mm{finer}, median of "
+            f"the mesh {middle:.2f} mm (5th to 95th percentile {low:.2f} to {high:.2f}); dihedral angles "
             f"{q.least_angle_deg:.1f} to {q.greatest_angle_deg:.1f} degrees",
             f"Volumes, mL (in the label map): {volumes}",
             "Surface sets, faces: " + ", ".join(f"{name} {len(rows)}" for name, rows in self.mesh.facets.items()),
@@ -111,7 +114,7 @@ def mesh(
         write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     save_figure(target.with_suffix(""), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
     tell(_CASE, WRITING, 1.0)
-    return Meshed(target, made, quality)
+    return Meshed(target, made, quality, meshing)
 
 
 def mesh_coarser(

@@ -32,6 +32,17 @@ def _bearable(threads: int) -> int:
 ThreadCount = Annotated[Count, AfterValidator(_bearable)]
 
 
+def is_like_auto(labels: Path) -> bool:
+    """Whether a label map is called nearly as `AUTO`, but not quite."""
+    return labels != AUTO and bool(difflib.get_close_matches(str(labels).lower(), [str(AUTO)]))
+
+
+def refuse_misspelt_auto(labels: Path, place: Path) -> None:
+    """InputError if a label map, relative to a folder, is not there and is called nearly as `AUTO`."""
+    if is_like_auto(labels) and not (place / labels).exists():
+        raise InputError(f"{labels}: no such file or folder. Did you mean {AUTO}? Check the spelling.")
+
+
 def in_parallel(workers: int | None) -> int:
     """How many jobs run in parallel: as many as there are cores, or fewer where so many ``workers`` are asked for."""
     cores = usable_cores()
@@ -121,9 +132,8 @@ class SubjectFiles(BoneAndBody):
         """InputError for the first path at which there is nothing, other than labels "auto"."""
         if self.labels == AUTO:
             return self.model_copy(update={"labels": None}).refuse_missing()
-        is_close = difflib.get_close_matches(str(self.labels).lower(), [str(AUTO)])
-        if is_close and type(self) is SubjectFiles and not Path(str(self.labels)).exists():  # others make none
-            raise InputError(f"{self.labels}: no such file or folder. Did you mean {AUTO}? Check the spelling.")
+        if self.labels is not None and type(self) is SubjectFiles:  # others make none
+            refuse_misspelt_auto(self.labels, Path())
         super().refuse_missing()
 
 

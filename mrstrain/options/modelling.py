@@ -88,9 +88,14 @@ class Directions(Options):
     shear_direction: Vector = (0.0, -1.0, 0.0)
     """Direction of the shear force on the tissue, LPS. Default: 0 -1 0 (anterior)."""
 
+    @property
+    def is_placed(self) -> bool:
+        """Whether somebody said where the plate lies."""
+        return "plate_normal" in self.model_fields_set
+
     def assumed(self, instead: str) -> str:
-        """A sentence if the plate lies where it does by default, with what to give ``instead``; empty otherwise."""
-        if self.plate_normal != INFERIOR:
+        """A sentence if nobody said where the plate lies, with what to give ``instead``; empty otherwise."""
+        if self.is_placed:
             return ""
         return f"The plate is taken to be inferior to the body (normal 0 0 -1, LPS). If it lies elsewhere, {instead}."
 

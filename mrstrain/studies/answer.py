@@ -8,7 +8,7 @@ import numpy as np
 
 from dvc.errors import InputError
 from dvc.report.page import Picture, Section
-from mrstrain.measurement.answer import NOTHING_BESIDE, MeasuredBeside, most_strained, table_of_loads
+from mrstrain.measurement.answer import table_of_loads
 from validate import NOTHING, Comparison
 from validate.curves import range_told
 from validate.load_comparison import STRAINED
@@ -26,21 +26,19 @@ _NEAREST = (
 
 
 def answer_of(
-    measured: Sequence[Section], compared: Sequence[Section], folder: Path, pictures: Sequence[Picture] = (),
-    beside: MeasuredBeside = NOTHING_BESIDE,
-) -> list[Section]:  # fmt: skip
+    measured: Sequence[Section], compared: Sequence[Section], folder: Path, pictures: Sequence[Picture] = ()
+) -> list[Section]:
     """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
 
-    It begins with the most strained tissue. Its table has a row for each load and tissue: the measured maximum shear
+    Its table has a row for each load and tissue: the measured maximum shear
     strain, and the best match. Without a comparison it has ``pictures`` of the measured strain; with one, its areas
     are folded.
     """
     table = table_of_loads(measured)
-    words = most_strained(table, beside)
     if not compared:
         if table is None:
             return []
-        return [Section("Measured strain", None, (table,), tuple(pictures), words, pictures_first=True)]
+        return [Section("Measured strain", None, (table,), tuple(pictures), pictures_first=True)]
     if table is None:
         return list(compared)
     comparison = _comparison(folder)
@@ -49,8 +47,7 @@ def answer_of(
         rows = tuple((*row, nearest.get((str(row[0]), str(row[1])), "–")) for row in table.rows)
         note = table.note + _NEAREST.format(low=comparison.strains[0], range=range_told(comparison.strains))
         table = replace(table, columns=(*table.columns, "best match"), rows=rows, note=note)
-    paragraphs = (*words, *compared[0].paragraphs)
-    first = replace(compared[0], tables=(table,), paragraphs=paragraphs)
+    first = replace(compared[0], tables=(table,))
     areas = [Section(_AREAS, None, compared[0].tables, folded=True)] if compared[0].tables else []
     return [first, *areas]
 

@@ -31,7 +31,7 @@ from fe import (
 )
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
-from mrstrain.options.measurement import in_parallel
+from mrstrain.options.measurement import in_parallel, refuse_misspelt_auto
 from mrstrain.options.modelling import ModelReading
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.credibility import details_not_given
@@ -171,7 +171,7 @@ class _Look:
             self.at_registration(labels)
         if study.models.sets and asked("mesh", "simulate", "drive"):
             drawn = None if study.mesh.file else drawn_to_mesh(study)
-            to_mesh = None if drawn is None else self.tried(read_labels, *drawn)
+            to_mesh = None if drawn is None else self.tried(self.drawn, *drawn)
             if asked("mesh") and to_mesh is not None:
                 self.at_meshing(to_mesh)
             if asked("simulate", "drive"):
@@ -189,6 +189,12 @@ class _Look:
         """An image of the study."""
         return read_image(self.study.path(given), allow_missing=self.study.images.allow_missing)
 
+    def drawn(self, labels: Path, names: Path | None) -> LabelMap:
+        """A label map of the study that is not made from the image."""
+        if labels == self.study.path(self.study.images.labels):
+            refuse_misspelt_auto(self.study.images.labels, self.study.place)
+        return read_labels(labels, names)
+
     def labels(self, reference: Image | None) -> LabelMap | None:
         """The labels, on the unloaded image's grid; None if they are to be made from the image."""
         if self.study.drawn_labels is None:
@@ -201,7 +207,7 @@ class _Look:
                 lacking = f"{table} has no label '{self.study.bone}'; it has {', '.join(names.values())}."
                 self.wrong.append(f"{self.study.at('images', 'bone')}: {lacking}")
             return None
-        labels = self.tried(read_labels, *self.study.drawn_labels)
+        labels = self.tried(self.drawn, *self.study.drawn_labels)
         if labels is not None:
             self.notes.append(f"Labels: {', '.join(labels.names.values())}")
             if reference is not None:
@@ -290,8 +296,10 @@ class _Look:
             there, bones = np.unique(labels.labels), bones_of(labels, self.study.mesh.bones)
             names = [name for n, name in labels.names.items() if n != 0 and n in there]
         soft = [name for name in names if name not in bones]
+        if_there = "" if labels is not None else ", if the label map that is made has it,"
         self.warnings += [
-            f"{name} will be meshed as soft tissue, but has the name of a bone. If it is one, add it to [mesh] bones."
+            f"{name}{if_there} will be meshed as soft tissue, but has the name of a bone. "
+            "If it is one, add it to [mesh] bones."
             for name in soft
             if warned and is_bones_name(name)
         ]

@@ -3,7 +3,6 @@
 import json
 import time
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 from dvc import read_labels, write_labels
@@ -14,6 +13,7 @@ from dvc.own_files import read_json
 from mrstrain.models.simulate import LOADS
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import ALL, OnProgress
+from mrstrain.records.time_left import Expected, TimeLeft
 from mrstrain.studies.file import FILE, Study, read_study
 from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import REGISTRATION
@@ -27,10 +27,10 @@ _SETS = ("trebbi", "erdemir", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
 _COARSE = "tissues_to_mesh_coarse"
 _COARSE_MM = 1.2  # voxels of the label map that is meshed
-_PHANTOM_SHARE = {
-    False: 0.15,
-    True: 0.01,
-}  # of the total time, for the coarse mesh (False) and the published size (True)
+_PHANTOM, _RUN = "phantom", "study"
+_PHANTOM_S = 42.0  # on two idle cores
+# Of the total time, for the coarse mesh (False) and the published size (True). On busy cores 0.17 and 0.27 were seen.
+_PHANTOM_SHARE = {False: 0.22, True: 0.01}
 _STUDY = """# Demonstration: a heel phantom whose strain is known at every point (see the folder truth).
 [study]
 name = "Phantom heel"
@@ -75,23 +75,39 @@ def demo(
     Raises OutputError if the folder contains another phantom, or other files that would be overwritten.
     """
     target, began = Path(out), time.monotonic()
-    _make(target, seed, full, None if progress is None else partial(_making, progress, _PHANTOM_SHARE[full]))
+    making = None if progress is None else Making(progress, full, began)
+    _make(target, seed, full, making)
     errors: dict[str, tuple[TissueError, ...]] = {}
 
     def compare(study: Study, outcomes: Mapping[str, StageOutcome]) -> None:
         errors.update(_errors(study, outcomes, read_errors(target / TABLE, outcomes)))
         write_errors(target / TABLE, errors, outcomes)
 
-    follower = Follower(progress, on_report, compare, began)
+    follower = Follower(progress, on_report, compare, began, {} if making is None else making.done)
     (done,) = run_studies([read_study(target)], workers=workers, follower=follower)
     complete = all(_reached(outcome) for outcome in done.outcomes.values())
     return Outcome(done.study.out, tuple(_summary(errors, done)), complete)
 
 
-def _making(progress: OnProgress, share: float, case: str, stage: str, fraction: float) -> None:
-    """Report how far the phantom is, and all, of which it takes a share of the time."""
-    progress(case, stage, fraction)
-    progress(ALL, "making the phantom", share * fraction)
+class Making:
+    """Reports how far the phantom is, and how far all is, by the time that the phantom took so far."""
+
+    def __init__(self, progress: OnProgress, full: bool, began: float) -> None:
+        self._progress, self._began = progress, began
+        run_s = _PHANTOM_S * (1.0 / _PHANTOM_SHARE[full] - 1.0)
+        self._left = TimeLeft({_PHANTOM: Expected(_PHANTOM_S), _RUN: Expected(run_s, before=(_PHANTOM,))}, 1)
+
+    def __call__(self, case: str, stage: str, fraction: float) -> None:
+        """Take the progress of the phantom."""
+        self._left.told(_PHANTOM, stage, fraction)
+        self._progress(case, stage, fraction)
+        spent = time.monotonic() - self._began
+        self._progress(ALL, "making the phantom", spent / (spent + self._left.seconds() + 1e-9))
+
+    @property
+    def done(self) -> dict[str, tuple[Expected, float]]:
+        """What the phantom was expected to take, and took; empty if it was there before."""
+        return {name: (self._left.stages[name], taken_s) for name, taken_s in self._left.took.items()}
 
 
 def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> None:

@@ -18,7 +18,15 @@ from dvc.tables import refuse_damaged_toml
 from mrstrain.options import modelling
 from mrstrain.options.acquisition import AcquisitionOptions
 from mrstrain.options.credibility import CredibilityOptions
-from mrstrain.options.measurement import AUTO, Frame, RegistrationOptions, SubjectFiles, Unit, command_parts
+from mrstrain.options.measurement import (
+    AUTO,
+    Frame,
+    RegistrationOptions,
+    SubjectFiles,
+    Unit,
+    command_parts,
+    is_like_auto,
+)
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
 from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.inputs import made_labels
@@ -77,7 +85,8 @@ class Images(SubjectFiles):
             raise ValueError("'correct_labels' needs an image without missing voxels; leave out allow_missing = true")
         if self.labels != AUTO:
             if self.marks or self.mark_names or self.labels_command:
-                raise ValueError("'marks', 'mark_names' and 'labels_command' are only for labels = \"auto\"")
+                hint = f" (did you mean that by '{self.labels}'?)" if is_like_auto(self.labels) else ""
+                raise ValueError(f"'marks', 'mark_names' and 'labels_command' are only for labels = \"auto\"{hint}")
         elif self.correct_labels:
             raise ValueError("'correct_labels' is for a label map that was drawn, not for labels = \"auto\"")
         elif self.labels_command is not None:
@@ -121,6 +130,11 @@ class Plate(modelling.PlateOptions):
 
     plate_normal: Vector = Field(default=modelling.INFERIOR, validation_alias="normal")
     """Direction from the body to the plate, LPS (x left, y posterior, z superior)."""
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether the plate lies elsewhere than `init` writes for everyone."""
+        return self.plate_normal != modelling.INFERIOR
 
 
 class Registering(RegistrationOptions):

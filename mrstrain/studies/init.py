@@ -10,7 +10,7 @@ import jinja2
 
 from dvc import read_image, read_labels
 from dvc.atomic_files import whole_file, write_whole
-from dvc.errors import InputError, OutputError
+from dvc.errors import InputError, OutputError, few
 from dvc.file_names import as_typed
 from dvc.images.bone_names import is_bones_name
 from dvc.io.images.dicom import is_dicom, is_multiframe
@@ -41,6 +41,7 @@ _NAMES = (
     "Recognised names: Load0 or NAME_unloaded, Load1 or NAME_loaded or NAME_140N, NAME_bone, NAME_labels, Load0-again. "
     "Rename the files, delete study.toml, and run mrstrain init again."
 )
+_SLICES = "A DICOM series belongs in a folder of its own, such as Load1; then delete study.toml, and run init again."
 _LOOKED_AT = 20
 PICTURE = "study.png"
 _TO_FILL_IN = "# FILL IN"  # of lines in the template
@@ -60,6 +61,7 @@ class StudyInputs:
     mesh_names: str | None = None
     results: list[str] = field(default_factory=list)
     unused: dict[str, str] = field(default_factory=dict)  # unused images and folders, with the reason
+    slices: str = ""  # single DICOM slices beside the images, which are not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,7 @@ class NewStudy:
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
         lines += [_NAMES] if _NO_ROLE in found.unused.values() else []
+        lines += [f"NOT USED: {found.slices}, single DICOM slices. {_SLICES}"] if found.slices else []
         file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)
         to_fill_in = [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
         todo = " Fill in the following lines, and remove the # at their beginning:" if to_fill_in else ""
@@ -153,6 +156,7 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
             f"{place} holds the slices of a DICOM series. Move each series to a folder of its own, such as "
             f"{place / 'Load0'} and {place / 'Load1'}."
         )
+    found.slices = few(_slices(place), most=1)
     picture, names = _drawn(place, found)
     answers = Answers() if ask is None else ask(found, names, picture)
     found.unused.pop(answers.bone_mask or "", None)
@@ -239,6 +243,18 @@ def _is_volume(path: Path) -> bool:
         return path.is_file() and (path.suffix.lower() != ".dcm" or is_multiframe(path))
     except OSError:  # unreadable
         return False
+
+
+def _slices(folder: Path) -> list[str]:
+    """Names of the single DICOM slices in a folder, by the end of their names or the content of the first files."""
+    try:
+        files = sorted(p for p in folder.iterdir() if p.is_file())
+        bare = [p for p in files if not p.suffix][:_LOOKED_AT]  # IM0001
+        return [
+            p.name for p in files if (p.suffix.lower() == ".dcm" and not _is_volume(p)) or (p in bare and is_dicom(p))
+        ]
+    except OSError:  # unreadable, so of no use
+        return []
 
 
 def _holds_dicom(folder: Path) -> bool:

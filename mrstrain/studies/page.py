@@ -25,7 +25,7 @@ from dvc.trust.verdict import worst
 from mrstrain.comparison.credibility import TITLE as CREDIBILITY
 from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.measurement.acquisition import ACQUIRED, acquisition_section, acquisition_sentence
-from mrstrain.measurement.answer import MeasuredBeside, in_short
+from mrstrain.measurement.answer import MeasuredBeside, told_once
 from mrstrain.options.measurement import MeshAndAxes
 from mrstrain.options.modelling import Directions
 from mrstrain.records.inputs import read_subject
@@ -68,17 +68,17 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     against_truth = error_against_truth(study, outcomes)
     of_each = [section for section in of_loads if section.title in study.loads]
     pictures = [] if compared or subject is None else _side_by_side(study, outcomes, subject)
+    verdict = _verdict([s.verdict.among(s.title) for s in of_loads if s.verdict], compared)
     beside = MeasuredBeside.of(_folders(study, outcomes), study.forces)
-    answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures, beside)
+    answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures)
+    short, answer = told_once(answer, verdict, beside)
     scans = acquisition_section(_folders(study, outcomes), study.acquisition)
     acquisition = [] if scans is None else [scans]
     credibility = study_credibility(study, outcomes)
     others = [*against_truth, *compared[1:], *registered, *labelled, *acquisition, *credibility, _stages(outcomes)]
     sections = [*answer, *(replace(section, folded=True) for section in others)]
-    verdict = _verdict([s.verdict.among(s.title) for s in of_loads if s.verdict], compared)
     judged = WITH_MODELS if any(one.verdict for one in compared[:1]) else MEASUREMENT
     lines, notes = record_lines(record), _incomplete(outcomes)
-    short = in_short(answer)
     write_report(
         path, study.study.name, verdict, sections, closing, lines, judged=judged, answer=short, notes=notes
     )  # fmt: skip
@@ -116,7 +116,7 @@ def write_page_in_progress(
     of_loads = [section for one in measured for section in one.result.sections]
     pictures = tuple(picture for section in of_loads for picture in _strain(section))
     sections = [
-        *answer_of(of_loads, (), study.out, pictures),
+        *told_once(answer_of(of_loads, (), study.out, pictures), None)[1],
         Section("Progress", None, (Table("Stages", ("stage", "status", "summary"), tuple(rows)),)),
     ]
     write_report(path, study.study.name, None, sections, (), {}, notes=[told], reload_s=None if ended else _RELOAD_S)

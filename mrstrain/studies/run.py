@@ -12,11 +12,11 @@ from dvc import Verdict
 from dvc.errors import InputError, ParameterError, few
 from dvc.io.result_folder import REPORT
 from dvc.memory import hand_memory_back
-from mrstrain.options.measurement import in_parallel
+from mrstrain.options.measurement import in_parallel, refuse_misspelt_auto
 from mrstrain.records.inputs import alone, make_output, refuse_small_disk
 from mrstrain.records.log import append, timed
 from mrstrain.records.progress import ALL, OnProgress
-from mrstrain.records.time_left import Expected, TimeLeft, seconds_to_end
+from mrstrain.records.time_left import Expected, seconds_to_end
 from mrstrain.studies.check import wrong_with
 from mrstrain.studies.costs import costs, disk_bytes, expected, gib_of, sizes_of
 from mrstrain.studies.file import Study, read_study
@@ -140,7 +140,7 @@ def run_studies(
     at_once, follower = in_parallel(workers), follower or Follower()
     reports = {prefix: Report(study, pipelines[prefix], follower.on_report) for prefix, study in named.items()}
     expectations: dict[str, Expected] = {}
-    watch = Watch(follower, reports, TimeLeft(expectations, at_once))
+    watch = Watch(follower, reports, follower.time_left({}, at_once))
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
@@ -166,6 +166,7 @@ def run_studies(
                 pipelines[prefix].gib = {stage.name: gib_of(stage, study, voxels, cells) for stage in left}
                 if scheduler is None:
                     _tell(*costs(study, stages, left, voxels, cells, at_once), log)
+        watch.left = follower.time_left(expectations, at_once)
         hand_memory_back()  # of the images that were checked
         with watch.reporting():
             run_all(pipelines, pool, logs, watch.ended)
@@ -197,6 +198,8 @@ def _planned(
         refuse_unknown(stages, only, force)
     files = dict.fromkeys(path for stages in planned.values() for stage in stages for path in stage.files)
     if missing := [path for path in files if not path.exists()]:
+        for study in studies.values():
+            refuse_misspelt_auto(study.images.labels, study.place)
         raise InputError("These files of the study do not exist:\n" + "\n".join(f"  {path}" for path in missing))
     pipelines = {
         name: Pipeline(planned[name], Ledger(study.out, study.place), only=only, force=force)

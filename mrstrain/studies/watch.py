@@ -12,7 +12,7 @@ from pathlib import Path
 from dvc.errors import OutputError
 from dvc.io.result_folder import REPORT
 from mrstrain.records.progress import ALL, NOTE, OnProgress, duration
-from mrstrain.records.time_left import TimeLeft
+from mrstrain.records.time_left import Expected, TimeLeft
 from mrstrain.studies.file import Study
 from mrstrain.studies.page import write_page_in_progress, write_run_report
 from mrstrain.studies.pipeline import Pipeline, StageOutcome
@@ -33,6 +33,13 @@ class Follower:
     on_report: OnReport | None = None  # as in `mrstrain.run`
     on_end: OnEnd | None = None  # called when all stages of a study have ended, before its report is written
     began: float = field(default_factory=time.monotonic)  # when the whole work began
+    before: Mapping[str, tuple[Expected, float]] = field(default_factory=dict)  # done before the run, and seconds taken
+
+    def time_left(self, expected: Mapping[str, Expected], workers: int) -> TimeLeft:
+        """The time left of stages; what was done before tells how fast this machine is."""
+        took = {name: taken_s for name, (_, taken_s) in self.before.items()}
+        done = {name: one for name, (one, _) in self.before.items()}
+        return TimeLeft(done | dict(expected), workers, began=dict.fromkeys(took, self.began), took=took)
 
 
 @dataclass(slots=True, eq=False)

@@ -120,7 +120,7 @@ def accuracy(
     if tell_plan is not None:
         minutes = max(expected_minutes(missing, at_once), 1.0) if missing else 0.0
         tell_plan(
-            f"Registrations to run: {len(missing)}, {at_once} at a time, in about {minutes:.0f} min; "
+            f"Registrations to run: {len(missing)}, {at_once} at a time, about {minutes:.0f} min on idle cores; "
             f"already done: {len(wanted) - len(missing)}."
         )
     with output_folder(folder), alone(target):

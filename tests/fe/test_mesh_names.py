@@ -14,6 +14,7 @@ from dvc.images.image import Grid, LabelMap
 from dvc.mesh import TetMesh
 from fe import MeshQuality, mesh_labels, read_tet_mesh, write_tet_mesh
 from mrstrain.models.mesh import Meshed
+from mrstrain.options.modelling import Finer, Meshing
 from tests.blocks import block
 from tests.fe.test_simulate import dome
 
@@ -56,14 +57,14 @@ def test_the_cut_is_found_in_whatever_case_skin_is_written(name: str, latticed, 
     assert (mesh.points_mm[mesh.facets["skin"]][:, :, 2].max(axis=1) < SIDE + SHIFT_MM).all()
     assert not (mesh.points_mm[mesh.facets["skin"]][:, :, 2].min(axis=1) > SIDE - SHIFT_MM).any()
     assert dict(quality.thin)[name] > 0.5  # one cell thick
-    assert not any("is called skin" in line for line in Meshed(tmp_path, mesh, quality).summary())
+    assert not any("is called skin" in line for line in Meshed(tmp_path, mesh, quality, Meshing()).summary())
 
 
 def test_without_a_skin_the_cut_is_told_to_count_as_outer_surface(latticed, tmp_path: Path) -> None:
     mesh, quality = latticed(post("dermis"))
     assert set(mesh.facets) == {"bone", "skin"}
     assert (mesh.points_mm[mesh.facets["skin"]][:, :, 2].min(axis=1) > SIDE - SHIFT_MM).any()
-    told = Meshed(tmp_path, mesh, quality).summary()
+    told = Meshed(tmp_path, mesh, quality, Meshing()).summary()
     assert [line for line in told if "no tissue is named skin" in line and "no surface set 'cut'" in line]
 
 
@@ -96,7 +97,7 @@ def test_the_summary_warns_of_volumes_and_angles(tmp_path: Path) -> None:
     def told(fat_ml: float, angle_deg: float) -> list[str]:
         volumes = (("fat", fat_ml, 10.0), ("skin", 5.05, 5.0))
         quality = MeshQuality(48, 27, angle_deg, 150.0, (1.0, 2.0, 3.0), volumes, ())
-        return [line for line in Meshed(tmp_path, mesh, quality).summary() if line.startswith("WARNING")]
+        return [line for line in Meshed(tmp_path, mesh, quality, Meshing()).summary() if line.startswith("WARNING")]
 
     assert told(9.7, 4.2) == [
         "WARNING: the volume of fat differs by -3.0 % from the label map.",
@@ -186,3 +187,12 @@ def test_two_surfaces_of_one_name_are_refused(tmp_path: Path) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", TetMesh(mesh.points_mm, mesh.cells, mesh.regions, facets), {})
     with pytest.raises(InputError, match=r"dome\.vtu: two surface sets are named 'bone' \(case is ignored\)"):
         read_tet_mesh(tmp_path / "dome.vtu")
+
+
+def test_the_summary_tells_the_edge_length_that_was_asked_and_that_of_the_mesh(tmp_path: Path) -> None:
+    quality = MeshQuality(48, 27, 20.0, 150.0, (1.25, 2.6, 4.0), (), ())
+    finer = Meshing(edge_mm=4.0, finer=Finer("skin", 1.5))
+    plain, fine = (Meshed(tmp_path, dome((2, 2, 2)), quality, of).summary()[0] for of in (Meshing(edge_mm=4.0), finer))
+    of_mesh = "median of the mesh 2.60 mm (5th to 95th percentile 1.25 to 4.00)"
+    assert f"requested edge length 4 mm, {of_mesh}" in plain
+    assert f"requested edge length 4 mm (1.5 mm in skin), {of_mesh}" in fine

@@ -15,6 +15,7 @@ from fe.meshing import _guessed, check_meshing
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.tissue_surfaces import borders_of, labels_at, thinned
 from mrstrain.models.mesh import Meshed
+from mrstrain.options.modelling import Meshing
 from tests.blocks import block
 
 NAMES = {1: "bone", 2: "fat", 3: "skin"}
@@ -133,7 +134,9 @@ def test_a_bone_that_is_meshed_as_tissue_is_told(meshed) -> None:
     mesh, quality = meshed
     for name, told in (("Talus", True), ("fat", False)):
         regions = {name: mesh.regions["fat"], "skin": mesh.regions["skin"]}
-        lines = Meshed(Path("a.vtu"), TetMesh(mesh.points_mm, mesh.cells, regions, mesh.facets), quality).summary()
+        lines = Meshed(
+            Path("a.vtu"), TetMesh(mesh.points_mm, mesh.cells, regions, mesh.facets), quality, Meshing()
+        ).summary()
         assert any(line.startswith(f"WARNING: {name} is meshed") for line in lines) == told
 
 

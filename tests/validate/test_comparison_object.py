@@ -20,6 +20,7 @@ from dvc.worker import side_by_side
 from tests.pictures import real_pictures
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
+from validate.agreement import Agreement, regression_told
 from validate.ranking import rank_over_loads
 from validate.report import area_rows, load_sections, overview
 from validate.tables import columns_of, read_curves, remove_earlier
@@ -176,6 +177,43 @@ def test_the_headline_is_the_best_match_or_the_area_of_the_best(comparison: Comp
     assert without.headline.startswith(f"{comparison.ranking.areas[0].model}: {over}")
 
 
+def test_slope_and_r2_of_the_best_match_are_told_at_once(comparison: Comparison, folder: Path) -> None:
+    best = comparison.ranking.areas[0].model
+    rows = [a for a in comparison.agreements if (a.model, a.quantity, a.part) == (best, "u_mm", ALL)]
+    slope, r2 = (" to ".join(dict.fromkeys(f"{end(getattr(a, of) for a in rows):.2f}" for end in (min, max)))
+                 for of in ("slope", "r2"))  # fmt: skip
+    told = f"Cell by cell, {best} on the measurement: displacement slope {slope}, R² {r2}"
+    assert slope != r2
+    page, summary = (folder / "report.html").read_text(), comparison.summary()
+    first = summary.index(comparison.ranking.statements[0])
+    assert summary[first + 1].startswith(told)
+    assert "Equal fields: 1 and 1. Strain elsewhere" in summary[first + 1]
+    before, picture = page.index(told), page.index("<figure")
+    assert before < picture
+    assert page.index(comparison.ranking.statements[0]) < before
+    table = re.search(r"<thead>.*?</tfoot>", page, re.DOTALL)
+    assert table is not None
+    assert re.search(r">slope</th><th[^>]*>R²</th></tr></thead>", table[0])
+
+
+def test_ranges_over_loads_are_told_and_uniform_fields_have_no_slope() -> None:
+    def row(load: str, quantity: str, slope: float, r2: float, part: str = ALL) -> Agreement:
+        return Agreement("a", load, quantity, part, 10, 1.0, 0.1, 0.1, slope, 0.0, r2, 0.0, 0.5, 0.0, 0.0, 0.0)
+
+    one = [row("Load1", "max_shear", 0.414, 0.094), row("Load1", "max_shear", 0.9, 0.9, "fat")]
+    told = regression_told(one, "a")
+    assert told.startswith("Cell by cell, a on the measurement: max. shear slope 0.41, R² 0.09. Equal ")
+    both = [
+        *one,
+        row("Load1", "u_mm", -0.2, 0.7),
+        row("Load2", "max_shear", -0.5, 0.7),
+        row("Load3", "u_mm", np.nan, 1),
+    ]
+    what = "displacement slope -0.20, R² 0.70 to 1.00; max. shear slope -0.50 to 0.41, R² 0.09 to 0.70"
+    assert f"measurement: {what} over the loads. Equal" in regression_told(both, "a")
+    assert regression_told([row("Load1", "u_mm", np.nan, np.nan)], "a") == regression_told(one, "b") == ""
+
+
 def test_a_load_whose_area_is_not_informative_has_no_best_model(comparison: Comparison) -> None:
     load, model = next(iter(comparison.coverage_ml)), comparison.ranking.areas[0].model
     line = next(line for line in comparison.summary() if line.startswith(f"{load}: area"))
@@ -267,11 +305,12 @@ def test_loads_without_an_informative_area_are_named_once_and_marked_in_the_tabl
     gammas = {"Load1": 0.38, "Load2": 0.6, "Load3": 0.38}
     loads = [compare_load(case(n, sheared(g), models, error_table(0.0, 0.001)), labels()) for n, g in gammas.items()]
     loads[2] = replace(loads[2], case=replace(loads[2].case, verdict=Verdict("caution", ("Poor.",))))
-    first = overview(loads, rank_over_loads(loads), (), (), ())
+    ranking = rank_over_loads(loads)
+    first = overview(loads, ranking, (), ranking.statements, ())
     few = "the measured maximum shear strain exceeds 0.2 in less than 1 % of the tissue"
     doubt = f"{few}, so the area metric is not informative."
     assert [line for line in first.paragraphs if doubt in line] == [f"Load1, Load3: {doubt}"]
     heads = ("all loads", "Load1 (not informative)", "Load2", "Load3 (use with care, not informative)")
-    assert first.tables[0].columns[2:] == heads
+    assert first.tables[0].columns[2:-2] == heads
     pictures: Any = dict.fromkeys(("curves", "slices"))
     assert load_sections(loads[0], pictures, pictures)[0].verdict is None  # what is not informative is no verdict

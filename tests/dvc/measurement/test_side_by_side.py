@@ -104,6 +104,13 @@ def test_pictures_of_single_loads_get_the_colours_of_the_load_with_most_strain(
     assert "The scale ends at 0.05: " in before[0].pictures[0].caption
     assert "one colour scale. It ends at 0.35: " in weak.pictures[0].caption
     assert weak.pictures[0].png != before[0].pictures[0].png
+    third = folders["Load1"].with_name("Load3")
+    third.mkdir()
+    (third / "max_shear.nii.gz").write_bytes(b"damaged")
+    damaged = replace(before[0], title="Load3")
+    with_third = on_one_scale([*before, damaged], subject, folders | {"Load3": third})
+    assert with_third[0].pictures[0].png == weak.pictures[0].png  # the others still share theirs
+    assert with_third[2] is damaged
     repeat = {name: folder.rename(folder.with_name("repeat")) if name == "Load2" else folder
               for name, folder in folders.items()}  # fmt: skip
     assert on_one_scale(before, subject, repeat)[0] is before[0]  # a repeat scan has no say

@@ -132,7 +132,7 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     }  # fmt: skip
     factors = rows(section, "Credibility factors")
     assert "fat Ogden, mu0 10.54 kPa" in factors["Model form"][0]
-    assert "P1, made from the label map with edges of 2.5 mm" in factors["Discretization error"][0]
+    assert "P1, made from the label map, requested edge length 2.5 mm" in factors["Discretization error"][0]
     assert str(section.tables).count("Residual forces at the end of a load") == 1
 
 

@@ -340,7 +340,7 @@ def test_a_plate_that_nobody_placed_is_said_to_be_inferior(tmp_path: Path) -> No
         "(--plate-normal)."
     )
     assert simulated() == [inferior]
-    assert simulated(plate_normal=DOWN) == []
+    assert simulated(plate_normal=DOWN) == simulated(plate_normal=(0.0, 0.0, -1.0)) == []
     assert simulated(towards={"Load1": (DOWN, (0.0, 1.0, 0.0))}) == []
 
 

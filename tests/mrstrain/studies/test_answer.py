@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from dvc.measurement.page import summary_table
-from dvc.report.page import LOPSIDED, Cell, Estimate, Section, Table
+from dvc.report.page import LOPSIDED, Estimate, Section, Table, write_report
 from dvc.trust.quality import NoiseFloor
 from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
-from mrstrain.measurement.answer import MeasuredBeside, in_short, most_strained
+from dvc.trust.verdict import Level, Verdict
+from mrstrain.measurement.answer import MeasuredBeside, most_strained, told_once
 from mrstrain.studies.answer import answer_of
 from tests.validate.test_comparison import case, cube, labels, result, sheared
 from validate import NOTHING, Area, Comparison, Criteria, compare
@@ -42,16 +43,14 @@ def section(load: str) -> Section:
 
 
 def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path) -> None:
-    overview = Section("Models and loads", tables=(Table("Area", ("model",), (("near",),)),))
+    areas_of = (Table("Area", ("model",), (("near",),)),)
+    overview = Section("Models and loads", tables=areas_of, paragraphs=("Best match: near.",))
     first, areas = answer_of([section("Load1"), section("Load2"), Section("Load3")], [overview], folder)
     (table,), (area,) = first.tables, areas.tables
     assert (first.title, areas.title, area.title) == ("Models and loads", "Areas of all models and loads", "Area")
     assert not first.folded
     assert areas.folded  # one small table is what a reader sees first
-    assert first.paragraphs == (
-        "Fat under Load1: measured maximum shear strain 0.131 (0.030 to 0.139) in the median and 0.420 at the 95th "
-        "percentile.",
-    )
+    assert first.paragraphs == ("Best match: near.",)
     table = replace(table, rows=tuple(tuple(map(str, row)) for row in table.rows))
     assert table.columns == ("load", "tissue", "median", "95th percentile", "best match")
     assert table.rows == (
@@ -105,37 +104,40 @@ def test_the_most_strained_tissue_is_surely_so() -> None:
     columns = ("load", "tissue", "median", "95th percentile")
     beside = MeasuredBeside({"Load1": "140 N"}, NoiseFloor(0.01, 0.01, 0.0112, 0.0292, 0.1))
 
-    def short(*rows: tuple[Cell, ...]) -> str:
-        return in_short([Section("Measured strain", None, (Table("Measured maximum shear strain", columns, rows),))])
-
-    assert short(*rows) == (
-        "Maximum shear strain in fat under Load1 (most strained): median 0.300 (0.200 to 0.400), 95th percentile 0.419 "
-        "(0.400 to 0.500), with 95 % intervals."
-    )
-    assert short(("Load1", "fat", Estimate(0.3), Estimate(0.41))).endswith(
-        "under Load1: median 0.300, 95th percentile 0.410."
-    )
-    assert "most strained" not in short(rows[0])
-    assert short() == in_short([]) == ""
     assert most_strained(Table("Measured", columns, rows), beside) == (
-        "The most strained tissue is fat under Load1 (140 N): measured maximum shear strain 0.300 (0.200 to 0.400) in "
-        "the median and 0.419 (0.400 to 0.500) at the 95th percentile, with 95 % intervals in brackets. It may be as "
-        "large in muscle, as the intervals overlap. The noise floor is 0.011 and 0.029.",
+        "Maximum shear strain in fat, the most strained tissue, under Load1 (140 N): median 0.300 (0.200 to 0.400), "
+        "95th percentile 0.419 (0.400 to 0.500), with 95 % intervals in brackets. It may be as large in muscle, as the "
+        "intervals overlap. The noise floor is 0.011 and 0.029."
     )
     below_zero = ("Load2", "tendon", fat[0], Estimate(0.5, (-0.45, 0.759)))
-    assert "is fat under Load1" in most_strained(Table("Measured", columns, (rows[1], below_zero)))[0]
+    assert "in fat, the most" in most_strained(Table("Measured", columns, (rows[1], below_zero)))
     apart = ("Load1", "muscle", fat[0], Estimate(0.3, (0.2, 0.399)))
-    assert "as large" not in most_strained(Table("Measured", columns, (rows[1], apart)))[0]
+    assert "as large" not in most_strained(Table("Measured", columns, (rows[1], apart)))
     unknown = ("Load1", "fat", Estimate(0.3), Estimate(0.41)), rows[0]
-    assert "as large" not in most_strained(Table("Measured", columns, unknown))[0]
-    (alone,) = most_strained(Table("Measured", columns, (("Load1", "soft tissue", *fat),)))
-    assert alone.startswith("Soft tissue under Load1: measured maximum shear strain 0.300")
+    assert "as large" not in most_strained(Table("Measured", columns, unknown))
+    alone = most_strained(Table("Measured", columns, (("Load1", "soft tissue", *fat),)))
+    assert alone.startswith("Maximum shear strain in soft tissue under Load1: median 0.300")
     alike = {"fat": 0.4195, "skin": 0.4202}  # 0.420 in the table
     without = tuple(("Load1", name, Estimate(0.3), Estimate(high)) for name, high in alike.items())
-    (plain,) = most_strained(Table("Measured", columns, without))
-    assert plain.startswith("The most strained tissue is skin under Load1: ")
-    assert plain.endswith("0.300 in the median and 0.420 at the 95th percentile.")
-    assert most_strained(Table("Measured", columns, rows[3:])) == most_strained(None) == ()
+    plain = most_strained(Table("Measured", columns, without))
+    assert plain.startswith("Maximum shear strain in skin, the most strained tissue, under Load1: ")
+    assert plain.endswith("median 0.300, 95th percentile 0.420.")
+    assert most_strained(Table("Measured", columns, rows[3:])) == most_strained(None) == ""
+
+
+@pytest.mark.parametrize("level", ["trust", "caution", "distrust", None])
+def test_the_most_strained_tissue_is_told_once_in_a_report(level: Level | None, folder: Path, tmp_path: Path) -> None:
+    verdict = None if level is None else Verdict(level, ("Checked.",))
+    overview = Section("Models and loads", paragraphs=("Best match: near.", "Another."))
+    told, sections = told_once(answer_of([section("Load1")], [overview], folder), verdict)
+    write_report(tmp_path / "report.html", "Heel", verdict, sections, (), {}, answer=told)
+    page = (tmp_path / "report.html").read_text()
+    strain = "Maximum shear strain in fat under Load1: median 0.131 (0.030 to 0.139), 95th percentile 0.420"
+    assert page.count(strain) == 1
+    banner = page[page.index("<h1>") : page.index("<details")]
+    assert (strain in banner) == (level in ("trust", "caution"))  # a strain that is not to be trusted is not in it
+    assert sections[0].paragraphs[-2:] == overview.paragraphs
+    assert told_once([], verdict) == ("", [])
 
 
 def test_the_noise_floor_is_that_of_any_load_and_none_without_a_repeat_scan(tmp_path: Path) -> None:

@@ -161,10 +161,27 @@ def test_labels_that_are_made_later_are_checked_by_what_they_are_made_from(study
     assert "other bone" not in " ".join(check(study).warnings)
     bones = ("[mesh]", '[mesh]\nbones = ["bone"]')
     assert wrong(study, named, ('"mine.toml", ', ""), bones) == ""  # the image may show no other bone
-    assert any(warning.startswith("other bone will be meshed as soft tissue") for warning in check(study).warnings)
+    if_there = "other bone, if the label map that is made has it, will be meshed as soft tissue"
+    assert any(warning.startswith(if_there) for warning in check(study).warnings)
     elsewhere = LabelMap(replace(GRID, origin_mm=GRID.origin_mm + 500.0), values, {1: "calcaneus", 2: "fat"})
     write_labels(study / "strokes.nii.gz", elsewhere)
     assert "strokes.nii.gz" in wrong(study, named, ('"mine.toml", ', ""))
+
+
+def test_a_label_map_called_nearly_as_auto_is_asked_about_once_as_on_the_command_line(study):
+    misspelt = ('labels = "tissues.nii.gz"\nnames = "tissues.csv"', 'labels = "autp"')
+    told = wrong(study, misspelt)
+    assert told.count("autp") == 1
+    assert "autp: no such file or folder. Did you mean auto? Check the spelling." in told
+    with pytest.raises(InputError, match="Did you mean auto"):
+        run(study)
+    with pytest.raises(InputError, match=r"only for labels = \"auto\" \(did you mean that by 'autp'\?\)"):
+        wrong(study, (misspelt[0], 'labels = "autp"\nmarks = "tissues.nii.gz"'))
+    wrong(study, (misspelt[0], 'labels = "auto"\nbone_mask = "gone.nii.gz"'))
+    with pytest.raises(InputError, match=r"do not exist:\n  \S+gone.nii.gz$"):
+        run(study)
+    (study / "autp").touch()
+    assert "Did you mean" not in wrong(study, misspelt)
 
 
 def test_labels_without_a_boundary_to_correct_are_told(study):

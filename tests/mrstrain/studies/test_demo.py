@@ -16,6 +16,7 @@ from dvc.errors import InputError, OutputError
 from dvc.report.page import Section
 from dvc.trust.verdict import Verdict
 from mrstrain.models.simulate import LOADS
+from mrstrain.records.time_left import Expected, Pace
 from mrstrain.studies.demo import _make, _reached, _summary
 from mrstrain.studies.file import read_study
 from mrstrain.studies.ledger import StageRecord
@@ -24,6 +25,7 @@ from mrstrain.studies.plan import plan
 from mrstrain.studies.run import StudyRun, run_studies
 from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import read_errors, write_errors
+from mrstrain.studies.watch import Follower
 from mrstrain.truth.phantom import phantom
 from phantoms import Heel, TissueError, under_load
 from tests.processes import stages_run_here
@@ -187,3 +189,38 @@ def test_errors_are_read_again_while_their_registrations_are_the_same(tmp_path):
     (tmp_path / "error.csv").write_text((tmp_path / "error.csv").read_text().replace("12345", "12x45", 1))
     with pytest.raises(InputError, match=r"error\.csv: the error of Load1 is damaged .*12x45.*Delete this file"):
         read_errors(tmp_path / "error.csv", outcomes("then"))
+
+
+@pytest.mark.parametrize("slower", [1, 10])
+@pytest.mark.parametrize(("phantom_s", "study_s"), [(42, 150), (64, 315), (140, 370)])  # idle; recorded on busy cores
+def test_the_time_left_is_right_within_a_factor_of_two_while_the_phantom_is_made(
+    phantom_s: int, study_s: int, slower: int, monkeypatch
+) -> None:
+    """From the first tenth on, and at the beginning of the study, which knows how long the phantom took."""
+    assert all(0.5 <= one <= 2.0 for one in _told_over_true(slower * phantom_s, slower * study_s, monkeypatch))
+
+
+def test_it_would_not_be_so_without_the_time_that_the_phantom_took(monkeypatch) -> None:
+    monkeypatch.setattr(Pace, "of", lambda self, stage: 1.0)
+    assert min(_told_over_true(140, 370, monkeypatch)) < 0.5
+
+
+def _told_over_true(phantom_s: int, study_s: int, monkeypatch) -> list[float]:
+    """The time left as told over the true one: at each image of a phantom, and when its study begins."""
+    clock, shares = [0.0], list[float]()
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    making = demonstration.Making(
+        lambda case, stage, fraction: shares.append(fraction) if case == "all" else None, False, 0.0
+    )
+    assert making.done == {}
+    ratios = []
+    for share in (0.0, 0.052, 0.105, 0.25, 0.329, 0.47, 0.55, 0.7, 0.78, 0.92, 1.0):  # as `phantom` tells
+        clock[0] = float(share * phantom_s)
+        making("phantom", "images and truth", share)
+        if clock[0] >= 0.1 * (phantom_s + study_s):
+            ratios.append(clock[0] * (1.0 / shares[-1] - 1.0) / (phantom_s + study_s - clock[0]))
+    assert len(ratios) > 3
+    ((_, taken_s),) = making.done.values()
+    assert taken_s == phantom_s
+    begun = Follower(before=making.done).time_left({"study": Expected(150.0)}, 1)  # what `costs` expects of it
+    return [*ratios, begun.seconds() / study_s]

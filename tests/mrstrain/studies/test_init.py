@@ -218,8 +218,16 @@ def test_enhanced_dicom_files_are_found_and_single_slices_left_alone(tmp_path, m
         init(tmp_path)
     assert not (tmp_path / "study.toml").exists()
     monkeypatch.setattr("mrstrain.studies.init.is_multiframe", lambda path: path.stem in ("Load0", "Load1"))
-    found = init(tmp_path).inputs
+    (tmp_path / "IM0001").write_bytes(bytes(128) + b"DICM")
+    (tmp_path / "README").write_text("no image")
+    begun = init(tmp_path)
+    found = begun.inputs
     assert (found.load0, found.loads, found.unused) == ("Load0.dcm", {"Load1": "Load1.DCM"}, {})
+    (told,) = [line for line in begun.summary() if "DICOM series" in line]
+    assert told.startswith("NOT USED: IM0001 and 3 more, single DICOM slices. ")
+    for path in (tmp_path / "IM0001", *tmp_path.glob("load2*"), tmp_path / "notes.dcm", begun.path):
+        path.unlink()
+    assert not any("DICOM series" in line for line in init(tmp_path).summary())
 
 
 def heel_in(folder: Path, pair) -> Path:

@@ -104,3 +104,15 @@ def test_a_figure_of_many_panels_prints_on_one_sheet_with_its_heading_and_captio
     tab.call("Emulation.setEmulatedMedia", media="print")
     assert tab.value("getComputedStyle(document.querySelector('.stack img')).objectFit") == "contain"  # not squeezed
     tab.call("Emulation.setEmulatedMedia", media="")
+
+
+def test_a_tall_figure_leaves_no_half_of_a_printed_sheet_empty(tab: Tab, tmp_path: Path) -> None:
+    """It takes half a sheet at most, so it stands below a quarter of a sheet of text and not on the next sheet."""
+    mesh = block((6, 6, 6), (60.0, 60.0, 60.0))
+    panels = [Slice(f"model {n}", np.zeros_like(mesh.points_mm), np.full(len(mesh.cells), 0.1 * n)) for n in range(22)]
+    picture = Picture("Strain", "Measured.", png_bytes(slice_sheet(mesh, panels, np.eye(3), np.full(3, 30.0))))
+    text = Section("Models and loads", paragraphs=("The volume that is compared. " * 25,))
+    write_report(tmp_path / "report.html", "A heel", None, [text, Section("Load1", pictures=(picture,))], [], {})
+    opened(tab, tmp_path / "report.html", 1400)
+    pdf = printed(tab)
+    assert sheets_of(pdf, "Figure") == [{1}, {1}]

@@ -122,7 +122,7 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     first = accuracy(tmp_path, cases=cases[:2], workers=1, tell_plan=plans.append)
     stamp = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "runs").iterdir()}
     study = accuracy(tmp_path, cases=cases, workers=1, tell_plan=plans.append)
-    assert [re.sub(r"in about \d+ min", "soon", p) for p in plans] == [
+    assert [re.sub(r"about \d+ min on idle cores", "soon", p) for p in plans] == [
         "Registrations to run: 2, 1 at a time, soon; already done: 0.",
         "Registrations to run: 1, 1 at a time, soon; already done: 2.",
     ]
