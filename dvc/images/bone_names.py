@@ -2,6 +2,8 @@
 
 import re
 
+BONE = "bone"
+"""Name of the bone in a label map that is made from its mask."""
 _BONES = {
     "bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform", "metatarsal",
     "femur", "trochanter", "patella", "pelvis", "sacrum", "coccyx", "ilium", "ischium", "pubis", "vertebra",

@@ -1,11 +1,14 @@
 """The surface of a bone as an MR image shows it: the outer edge of its dark rim."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, label, maximum
+from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform_edt, gaussian_filter, label, maximum
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.images.depth import depth_mm
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
 
@@ -18,11 +21,13 @@ _EDGE = 0.4  # of the step from rim to soft tissue: the rim's darkest voxels sti
 _RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are smaller
 _ONE_VOXEL = 1.05
 _LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no surface
+_MEAN_MM = 6.0  # standard deviation of the neighbourhood over which a distance to the rim is averaged
+_LEAST_SHARE = 0.1  # of the surface there that shows a rim: below, the distance tends to zero
 NUMBERS = {
     "reach": _REACH, "blur_mm": _BLUR_MM, "around_mm": _AROUND_MM, "dark_percent": _DARK_PERCENT, "edge": _EDGE,
     "rim_mm": _RIM_MM, "one_voxel": _ONE_VOXEL, "least_step": _LEAST_STEP,
 }  # fmt: skip
-"""Every number that determines where a surface is moved to, for a record."""
+"""Every number that determines where `bone_to_rim` moves a surface to, for a record."""
 
 
 def reach_of(spacing_mm: FloatArray) -> float:
@@ -36,11 +41,39 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     The surface stays where nothing within reach is as dark as a rim. Without labels, tendon at the bone counts as rim.
     ``image`` has no bias field; the bone and the ``body``, bone included, are on its grid.
     """
-    spacing = image.grid.spacing_mm
-    box = bone.box(int(np.ceil((reach_of(spacing) + _TRUNCATE * _AROUND_MM) / spacing.min())))
-    part = fill_missing(Image(image.grid.part(box), image.values[box]))
-    given, found = bone.inside[box], bone.inside.copy()
-    found[box] = bones_to_rims(part.values, given, body.inside[box] & ~given, (), spacing, rims_have_gaps=True)
+    part, given, soft, box = _around(image, bone, body)
+    found = bone.inside.copy()
+    found[box] = bones_to_rims(part.values, given, soft, (), part.grid.spacing_mm, rims_have_gaps=True)
+    return Mask(bone.grid, found)
+
+
+def bone_to_mean_rim(image: Image, bone: Mask, body: Mask) -> Mask:
+    """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
+
+    The distance is averaged along the surface in a neighbourhood of 6 mm (standard deviation). A mask that is too
+    large or too small is so corrected, and an exact one keeps its details, which noise would change if each voxel went
+    to the rim as in `bone_to_rim`. Where the dark goes on beyond a rim, as in tendon, and where there is no rim, the
+    distance is that of the neighbourhood; it is zero where a rim is far. Parameters as in `bone_to_rim`.
+    """
+    part, given, soft, box = _around(image, bone, body)
+    spacing = part.grid.spacing_mm
+    rims = _Rims.of(part.values, given, soft, spacing, rims_have_gaps=True)
+    depth = depth_mm(given, spacing)
+    surface = rims.near & (np.abs(depth) < 0.5 * float(spacing.mean()))
+    shown = surface & rims.seen
+    if rims.goes_on.any():
+        shown &= distance_transform_edt(~rims.goes_on, sampling=spacing) > reach_of(spacing)
+    if not shown.any():
+        return bone
+    off = depth_mm(np.where(rims.seen, rims.found, given), spacing) - depth
+    sigma = _MEAN_MM / spacing
+    all_of, share, total = (
+        gaussian_filter(of.astype(np.float64), sigma, mode="constant", truncate=_TRUNCATE)
+        for of in (surface, shown, np.where(shown, off, 0.0))
+    )
+    moved = depth + total / np.maximum(np.maximum(share, _LEAST_SHARE * all_of), np.finfo(float).tiny)
+    found = bone.inside.copy()
+    found[box] = np.where(rims.near & ~rims.core, moved > 0.0, given)
     return Mask(bone.grid, found)
 
 
@@ -56,32 +89,63 @@ def bones_to_rims(
     image without its bias field and without missing voxels. If ``rims_have_gaps``, surfaces also stay farther than the
     reach from everything as dark as a rim.
     """
-    from skimage.segmentation import watershed  # takes longer to import than most registrations have time for
-
-    reach_mm = reach_of(spacing_mm)
-    inside, outside = (distance_transform_edt(of, sampling=spacing_mm) for of in (given, ~given))
-    parts, count = label(given)
-    deepest = np.concatenate([[0.0], np.atleast_1d(maximum(inside, parts, np.arange(1, count + 1)))])
-    core = given & (inside > np.minimum(reach_mm, 0.5 * deepest)[parts])
-    blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
-    seeds = np.where(core, 1, np.where((outside > reach_mm) | ~(soft | given), 2, 0))
-    inner = watershed(-blurred, seeds) == 1
-    near = (inside <= reach_mm) & (outside <= reach_mm) & (soft | given)
-    beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
-    dark = float(np.percentile(blurred[near], _DARK_PERCENT))
-    rim = near & (blurred < dark + _EDGE * (beside - dark))
-    known = distance_transform_edt(~rim, sampling=spacing_mm) <= reach_mm if rims_have_gaps else near
-    thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
-    rim &= distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm
-    found = (inner | rim) & (soft | given)
-    joined, _ = label(found)
-    found = np.isin(joined, np.unique(joined[core])) & found
-    found |= binary_fill_holes(found)
-    seen = near & known & (beside > _LEAST_STEP * dark)
+    rims = _Rims.of(values, given, soft, spacing_mm, rims_have_gaps=rims_have_gaps)
+    seen = rims.seen
     for tissue in tissues:
-        if float(np.median(blurred[tissue])) < _LEAST_STEP * dark:
-            seen &= distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_mm
-    return np.where(seen, found, given)
+        if float(np.median(rims.blurred[tissue])) < _LEAST_STEP * rims.dark:
+            seen = seen & (distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_of(spacing_mm))
+    return np.where(seen, rims.found, given)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rims:
+    """Dark rims of bones; masks are (ni, nj, nk)."""
+
+    found: BoolArray  # bones up to the outer edge of their rims
+    core: BoolArray  # of the bones given: farther inside than their surfaces can move
+    near: BoolArray  # where surfaces can move
+    seen: BoolArray  # where the image shows the edge of a rim
+    goes_on: BoolArray  # as dark as a rim, but beyond its greatest thickness
+    blurred: Float32Array  # image
+    dark: float  # brightness of the rims
+
+    @classmethod
+    def of(
+        cls, values: Float32Array, given: BoolArray, soft: BoolArray, spacing_mm: FloatArray, *, rims_have_gaps: bool
+    ) -> Self:
+        """Rims of the bones given; parameters as in `bones_to_rims`."""
+        from skimage.segmentation import watershed  # takes longer to import than most registrations have time for
+
+        reach_mm = reach_of(spacing_mm)
+        inside, outside = (distance_transform_edt(of, sampling=spacing_mm) for of in (given, ~given))
+        parts, count = label(given)
+        deepest = np.concatenate([[0.0], np.atleast_1d(maximum(inside, parts, np.arange(1, count + 1)))])
+        core = given & (inside > np.minimum(reach_mm, 0.5 * deepest)[parts])
+        blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
+        seeds = np.where(core, 1, np.where((outside > reach_mm) | ~(soft | given), 2, 0))
+        inner = watershed(-blurred, seeds) == 1
+        near = (inside <= reach_mm) & (outside <= reach_mm) & (soft | given)
+        beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
+        dark = float(np.percentile(blurred[near], _DARK_PERCENT))
+        as_dark = near & (blurred < dark + _EDGE * (beside - dark))
+        known = distance_transform_edt(~as_dark, sampling=spacing_mm) <= reach_mm if rims_have_gaps else near
+        thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
+        rim = as_dark & (distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm)
+        found = (inner | rim) & (soft | given)
+        joined, _ = label(found)
+        found = np.isin(joined, np.unique(joined[core])) & found
+        found |= binary_fill_holes(found)
+        seen = near & known & (beside > _LEAST_STEP * dark)
+        goes_on = as_dark & ~found & binary_dilation(found) | found & (outside > reach_mm - spacing_mm.min())
+        return cls(found, core, near, seen, goes_on, blurred, dark)
+
+
+def _around(image: Image, bone: Mask, body: Mask) -> tuple[Image, BoolArray, BoolArray, tuple[slice, ...]]:
+    """Image, bone and soft tissue around the bone, and the part of the grid that they are."""
+    spacing = image.grid.spacing_mm
+    box = bone.box(int(np.ceil((reach_of(spacing) + _TRUNCATE * _AROUND_MM) / spacing.min())))
+    part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
+    return part, given, body.inside[box] & ~given, box
 
 
 def _mean_around(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -> FloatArray:

@@ -130,7 +130,7 @@ def combined(
     (name, *_), known = bones_of(labels), bone
     if known is None:
         known = correct_labels(image, carried.labels, watch=lambda share: watch(0.4 * share)).labels.region(name)
-    found = label_tissues(image, known, body, watch=lambda share: watch(0.4 + 0.6 * share))
+    found = label_tissues(image, known, body, watch=lambda share: watch(0.4 + 0.6 * share), bone_is_exact=True)
     return _weighed(found, carried, _groups(found, other, labels, name))
 
 

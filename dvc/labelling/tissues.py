@@ -10,7 +10,8 @@ from dvc.arguments import checked
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
-from dvc.images.bone_names import is_bones_name
+from dvc.images.bone_names import BONE, is_bones_name
+from dvc.images.bone_rim import bone_to_mean_rim
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import tissue_mask
@@ -20,7 +21,7 @@ from dvc.labelling.brightness import Levels, brighter_share, two_levels
 from dvc.labelling.marks import corrected, grown
 from dvc.labelling.skin import Skin
 
-NAMES = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
+NAMES = {1: BONE, 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
 """Numbers and names of the tissues that can be found without marks."""
 _DARK = 0.7  # of muscle's brightness: darker are cortical bone and tendon
 _SURE = 0.9
@@ -57,7 +58,7 @@ class TissueLabels:
 @checked
 def label_tissues(
     image: Image, bone: Mask | None = None, body: Mask | None = None, marks: LabelMap | None = None,
-    watch: Callable[[float], None] = lambda _: None,
+    watch: Callable[[float], None] = lambda _: None, *, bone_is_exact: bool = False,
 ) -> TissueLabels:  # fmt: skip
     """Label the tissues of an unloaded image, given its bone, or a few marks.
 
@@ -71,16 +72,20 @@ def label_tissues(
         Unloaded image, such as a T1- or proton-density-weighted one, where fat is brighter than muscle and skin. Where
         it ends in missing voxels, nothing is labelled; holes in it are.
     bone : Mask, optional
-        The bone, on any grid of the image's frame.
+        The bone, on any grid of the image's frame. Its surface is moved along its normal, by up to 2.5 times the mean
+        voxel edge, by its mean distance to the outer edge of the bone's dark rim in a neighbourhood of 6 mm. It stays
+        where the image shows no such rim.
     body : Mask, optional
         The body. Default: found by an intensity threshold.
     marks : LabelMap, optional
         A few voxels of each tissue, by name, on any grid of the image's frame. A bone that is marked is found inside
         its dark rim; marked fat and muscle tell their brightness; another tissue, such as tendon, is found where it is
-        joined to its mark. Where a mark is in the wrong tissue, the tissues within 8 mm are found again. A bone that is
-        given as a mask stays as it is: marks in it change nothing.
+        joined to its mark. Where a mark is in the wrong tissue, the tissues within 8 mm are found again. Marks in a
+        bone that is given as a mask change nothing.
     watch : callable, optional
         Told how far it is, from 0 to 1.
+    bone_is_exact : bool
+        Whether the mask of the bone is kept as it is.
 
     Raises
     ------
@@ -115,6 +120,9 @@ def label_tissues(
     whole = whole | known
     watch(0.1)
     even = fill_missing(without_bias_field(image))
+    if known.any() and not bone_is_exact:
+        known = bone_to_mean_rim(even, Mask(grid, known), Mask(grid, whole)).inside
+        soft = whole & ~known
     watch(0.15)
     skin = Skin.of(even, Mask(grid, whole), known | image.missing)
     watch(0.5)
@@ -122,7 +130,7 @@ def label_tissues(
         soft = soft & binary_fill_holes(~image.missing)
         whole = soft | known
     marked, outside = _in_soft_tissue(marked, soft, known)
-    chance, notes = {NAMES[1]: known.astype(np.float32)} if known.any() else {}, list[str]()
+    chance, notes = {BONE: known.astype(np.float32)} if known.any() else {}, list[str]()
     left = soft.astype(np.float32)  # probability that is not given to a tissue yet
     if skin is None:
         notes.append("No skin was found: the image shows no darker layer at the surface of the body.")
@@ -189,7 +197,7 @@ def _in_soft_tissue(
     for name, mark in marked.items():
         if is_bones_name(name) and (mark & bone).any():
             continue
-        if name == NAMES[1] and bone.any():
+        if name == BONE and bone.any():
             raise InputError(
                 f"The strokes of {name} lie outside the mask of the bone. If they mark another bone, give its own "
                 "name, such as talus (mark_names); if not, correct the mask."

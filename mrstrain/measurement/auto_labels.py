@@ -7,6 +7,7 @@ from pathlib import Path
 from dvc import Engine
 from dvc.errors import InputError
 from dvc.file_names import one_spelling
+from dvc.images.bone_names import BONE
 from dvc.io.images.labels import read_names
 from dvc.measurement.subject import bones_of
 from dvc.report.page import Section
@@ -54,16 +55,20 @@ def check_auto(files: SubjectFiles, strokes: Marks, cases: Sequence[str], scans:
 def labelled(
     load0: Path, files: SubjectFiles, strokes: Marks, out: Path, tell: Callable[[float], None]
 ) -> tuple[SubjectFiles, tuple[Section, ...]]:
-    """Make the label map; the files with it, and its section of the report."""
+    """Make the label map; the files with it, and its section of the report.
+
+    The bone is then that of the label map, whose surface is at its dark rim, and not its mask.
+    """
     from mrstrain.measurement.label import label  # with it come skimage.restoration and scipy.stats: 0.7 s
 
     labels, names = made_labels(out)
-    marked = None if files.bone is not None else _marked_bone(strokes, files.bone_label)
+    called = BONE if files.bone is not None else _marked_bone(strokes, files.bone_label)
     tell(0.0)
     told = partial(_of_tissues, tell)
     made = label(load0, out=labels, bone=files.bone, tissue=files.tissue, **dict(strokes), progress=told)
-    bone = next((name for name in read_names(names).values() if name.casefold() == marked), None)
-    return files.model_copy(update={"labels": labels, "names": names, "bone_label": bone}), (made.section,)
+    bone = next((name for name in read_names(names).values() if name.casefold() == called), None)
+    update = {"bone": None, "labels": labels, "names": names, "bone_label": bone}
+    return files.model_copy(update=update), (made.section,)
 
 
 def _of_tissues(tell: Callable[[float], None], _: str, stage: str, fraction: float) -> None:

@@ -256,8 +256,8 @@ class _Look:
 
     def at_masks(self, reference: Image | None) -> None:
         """Check the masks of the bone and the body, if the unloaded image is read."""
-        subject = self.study.subject_files
-        for mask in (subject.bone, subject.tissue):
+        images = self.study.images.located(self.study.place)
+        for mask in (images.bone, images.tissue):
             if mask is not None and reference is not None:
                 self.tried(read_mask, mask, reference.grid)
 

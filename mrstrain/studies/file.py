@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
 from dvc.file_names import as_file_name, clash, one_spelling, refuse_path
+from dvc.images.bone_names import BONE
 from dvc.io.result_folder import REPEAT
 from dvc.own_files import parse_toml
 from dvc.tables import refuse_damaged_toml
@@ -254,11 +255,20 @@ class Study(_Part):
 
     @property
     def subject_files(self) -> SubjectFiles:
-        """Masks and labels of the unloaded image; the bone by its mask, or else by its label."""
+        """Masks and labels of the unloaded image; the bone by its mask, or else by its label.
+
+        In a label map that is made from the mask of the bone, the surface of the bone is at its dark rim.
+        """
         labels, names = self.labels
         files = self.images.narrowed(SubjectFiles).located(self.place)
-        bone_label = None if files.bone else self.bone
-        return files.model_copy(update={"labels": labels, "names": names, "bone_label": bone_label})
+        update: dict[str, object] = {"labels": labels, "names": names}
+        if files.bone is None:
+            update["bone_label"] = self.bone
+        elif self.drawn_labels is None and self.images.labels_command is None:
+            update |= {"bone": None, "bone_label": BONE}
+        else:
+            update["bone_label"] = None
+        return files.model_copy(update=update)
 
     def given(self, paths: Sequence[Path | None]) -> tuple[Path, ...]:
         """Those of these files that are not made by the stage "label"."""
