@@ -22,6 +22,7 @@ _RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are sma
 _ONE_VOXEL = 1.05
 _LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no surface
 _MEAN_MM = 6.0  # standard deviation of the neighbourhood over which a distance to the rim is averaged
+_LEAST_VOXELS = 0.2  # of such a mean: smaller ones are noise
 _LEAST_SHARE = 0.1  # of the surface there that shows a rim: below, the distance tends to zero
 NUMBERS = {
     "reach": _REACH, "blur_mm": _BLUR_MM, "around_mm": _AROUND_MM, "dark_percent": _DARK_PERCENT, "edge": _EDGE,
@@ -53,7 +54,8 @@ def bone_to_mean_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     The distance is averaged along the surface in a neighbourhood of 6 mm (standard deviation). A mask that is too
     large or too small is so corrected, and an exact one keeps its details, which noise would change if each voxel went
     to the rim as in `bone_to_rim`. Where the dark goes on beyond a rim, as in tendon, and where there is no rim, the
-    distance is that of the neighbourhood; it is zero where a rim is far. Parameters as in `bone_to_rim`.
+    distance is that of the neighbourhood; it is zero where a rim is far, and where it is less than a fifth of a voxel.
+    Parameters as in `bone_to_rim`.
     """
     part, given, soft, box = _around(image, bone, body)
     spacing = part.grid.spacing_mm
@@ -71,7 +73,8 @@ def bone_to_mean_rim(image: Image, bone: Mask, body: Mask) -> Mask:
         gaussian_filter(of.astype(np.float64), sigma, mode="constant", truncate=_TRUNCATE)
         for of in (surface, shown, np.where(shown, off, 0.0))
     )
-    moved = depth + total / np.maximum(np.maximum(share, _LEAST_SHARE * all_of), np.finfo(float).tiny)
+    mean = total / np.maximum(np.maximum(share, _LEAST_SHARE * all_of), np.finfo(float).tiny)
+    moved = np.where(np.abs(mean) < _LEAST_VOXELS * float(spacing.mean()), depth, depth + mean)
     found = bone.inside.copy()
     found[box] = np.where(rims.near & ~rims.core, moved > 0.0, given)
     return Mask(bone.grid, found)

@@ -74,7 +74,7 @@ def label_tissues(
     bone : Mask, optional
         The bone, on any grid of the image's frame. Its surface is moved along its normal, by up to 2.5 times the mean
         voxel edge, by its mean distance to the outer edge of the bone's dark rim in a neighbourhood of 6 mm. It stays
-        where the image shows no such rim.
+        where this is less than a fifth of a voxel, and where the image shows no such rim.
     body : Mask, optional
         The body. Default: found by an intensity threshold.
     marks : LabelMap, optional
