@@ -21,13 +21,16 @@ _EDGE = 0.4  # of the step from rim to soft tissue: the rim's darkest voxels sti
 _RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are smaller
 _ONE_VOXEL = 1.05
 _LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no surface
-_MEAN_MM = 6.0  # standard deviation of the neighbourhood over which a distance to the rim is averaged
+_MEAN_MM, _LOCAL = 6.0, 1.25  # mm and voxels: standard deviations of two means of the distance to the rim
+_LEAST, _LEAST_LOCAL = 0.2, 0.375  # voxels: smaller means are noise
+_CLEAR, _CLEAR_LOCAL = 1.0, 2.0  # reaches from where the dark goes on: nearer distances are left out of the means
 _LEAST_SHARE = 0.1  # of the surface there that shows a rim: below, the distance tends to zero
 NUMBERS = {
     "reach": _REACH, "blur_mm": _BLUR_MM, "around_mm": _AROUND_MM, "dark_percent": _DARK_PERCENT, "edge": _EDGE,
-    "rim_mm": _RIM_MM, "one_voxel": _ONE_VOXEL, "least_step": _LEAST_STEP,
+    "rim_mm": _RIM_MM, "one_voxel": _ONE_VOXEL, "least_step": _LEAST_STEP, "mean": [_MEAN_MM, _LEAST, _CLEAR],
+    "local_mean": [_LOCAL, _LEAST_LOCAL, _CLEAR_LOCAL], "least_share": _LEAST_SHARE,
 }  # fmt: skip
-"""Every number that determines where `bone_to_rim` moves a surface to, for a record."""
+"""Every number that determines where a surface is moved to, for a record."""
 
 
 def reach_of(spacing_mm: FloatArray) -> float:
@@ -36,44 +39,16 @@ def reach_of(spacing_mm: FloatArray) -> float:
 
 
 def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
-    """The bone of a mask, with its surface at the outer edge of its dark rim; see `bones_to_rims`.
+    """The bone of a mask, with its surface moved to its dark rim; see `bones_to_rims`.
 
-    The surface stays where nothing within reach is as dark as a rim. Without labels, tendon at the bone counts as rim.
-    ``image`` has no bias field; the bone and the ``body``, bone included, are on its grid.
+    The surface also stays where nothing within reach is as dark as a rim. ``image`` has no bias field; the bone and the
+    ``body``, bone included, are on its grid.
     """
-    part, given, soft, box = _around(image, bone, body)
+    spacing = image.grid.spacing_mm
+    box = bone.box(int(np.ceil((reach_of(spacing) + _TRUNCATE * _AROUND_MM) / spacing.min())))
+    part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
     found = bone.inside.copy()
-    found[box] = bones_to_rims(part.values, given, soft, (), part.grid.spacing_mm, rims_have_gaps=True)
-    return Mask(bone.grid, found)
-
-
-def bone_to_mean_rim(image: Image, bone: Mask, body: Mask) -> Mask:
-    """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
-
-    The distance is averaged along the surface in a neighbourhood of 6 mm (standard deviation). A mask that is too
-    large or too small is so corrected, and an exact one keeps its details, which noise would change if each voxel went
-    to the rim as in `bone_to_rim`. Where the dark goes on beyond a rim, as in tendon, and where there is no rim, the
-    distance is that of the neighbourhood; it is zero where a rim is far. Parameters as in `bone_to_rim`.
-    """
-    part, given, soft, box = _around(image, bone, body)
-    spacing = part.grid.spacing_mm
-    rims = _Rims.of(part.values, given, soft, spacing, rims_have_gaps=True)
-    depth = depth_mm(given, spacing)
-    surface = rims.near & (np.abs(depth) < 0.5 * float(spacing.mean()))
-    shown = surface & rims.seen
-    if rims.goes_on.any():
-        shown &= distance_transform_edt(~rims.goes_on, sampling=spacing) > reach_of(spacing)
-    if not shown.any():
-        return bone
-    off = depth_mm(np.where(rims.seen, rims.found, given), spacing) - depth
-    sigma = _MEAN_MM / spacing
-    all_of, share, total = (
-        gaussian_filter(of.astype(np.float64), sigma, mode="constant", truncate=_TRUNCATE)
-        for of in (surface, shown, np.where(shown, off, 0.0))
-    )
-    moved = depth + total / np.maximum(np.maximum(share, _LEAST_SHARE * all_of), np.finfo(float).tiny)
-    found = bone.inside.copy()
-    found[box] = np.where(rims.near & ~rims.core, moved > 0.0, given)
+    found[box] = bones_to_rims(part.values, given, body.inside[box] & ~given, (), spacing, rims_have_gaps=True)
     return Mask(bone.grid, found)
 
 
@@ -81,20 +56,31 @@ def bones_to_rims(
     values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray, *,
     rims_have_gaps: bool = False,
 ) -> BoolArray:  # fmt: skip
-    """Bones (ni, nj, nk) whose surfaces lie within reach of those given, at the outer edge of their dark rims.
+    """Bones (ni, nj, nk) whose surfaces are moved by their mean distance to the outer edge of their dark rims.
 
-    From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim. The
-    bone gets the rest of the rim, up to the edge with the brighter ``soft`` tissue. Where the image shows no such edge,
-    and beside those of the ``tissues`` that are as dark as a rim, such as tendon, surfaces stay. ``values`` are of an
-    image without its bias field and without missing voxels. If ``rims_have_gaps``, surfaces also stay farther than the
-    reach from everything as dark as a rim.
+    The distance is averaged along the surface in a neighbourhood of 6 mm (standard deviation), which corrects bones
+    that are too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects what is off in
+    patches. A surface moves only where a mean is at least .2 and .375 voxels: exact bones stay, which noise would
+    change if each voxel went to the rim. Where the image shows no rim, beside those of the ``tissues`` that are as dark
+    as one, and where the dark goes on beyond the rim, as in tendon, the distance is that of the neighbourhood; it is
+    zero where a rim is far. ``values`` are of an image without its bias field and without missing voxels, ``soft`` is
+    soft tissue. If ``rims_have_gaps``, a rim is shown only within reach of something that dark.
     """
     rims = _Rims.of(values, given, soft, spacing_mm, rims_have_gaps=rims_have_gaps)
-    seen = rims.seen
+    reach_mm, edge_mm, seen = reach_of(spacing_mm), float(spacing_mm.mean()), rims.seen
     for tissue in tissues:
         if float(np.median(rims.blurred[tissue])) < _LEAST_STEP * rims.dark:
-            seen = seen & (distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_of(spacing_mm))
-    return np.where(seen, rims.found, given)
+            seen = seen & (distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_mm)
+    clear_mm = np.full(given.shape, np.inf)
+    if rims.goes_on.any():
+        clear_mm = distance_transform_edt(~rims.goes_on, sampling=spacing_mm)
+    depth, depth_of_rim = (depth_mm(of, spacing_mm) for of in (given, np.where(seen, rims.found, given)))
+    for around_mm, least, clear in ((_MEAN_MM, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
+        surface = rims.near & (np.abs(depth) < 0.5 * edge_mm)
+        known = surface & seen & (clear_mm > clear * reach_mm)
+        off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing_mm)
+        depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)
+    return np.where(rims.near & ~rims.core, depth > 0.0, given)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +99,11 @@ class _Rims:
     def of(
         cls, values: Float32Array, given: BoolArray, soft: BoolArray, spacing_mm: FloatArray, *, rims_have_gaps: bool
     ) -> Self:
-        """Rims of the bones given; parameters as in `bones_to_rims`."""
+        """Rims of the bones given; parameters as in `bones_to_rims`.
+
+        From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim.
+        A bone gets the rest of the rim, up to the edge with the brighter soft tissue.
+        """
         from skimage.segmentation import watershed  # takes longer to import than most registrations have time for
 
         reach_mm = reach_of(spacing_mm)
@@ -140,12 +130,13 @@ class _Rims:
         return cls(found, core, near, seen, goes_on, blurred, dark)
 
 
-def _around(image: Image, bone: Mask, body: Mask) -> tuple[Image, BoolArray, BoolArray, tuple[slice, ...]]:
-    """Image, bone and soft tissue around the bone, and the part of the grid that they are."""
-    spacing = image.grid.spacing_mm
-    box = bone.box(int(np.ceil((reach_of(spacing) + _TRUNCATE * _AROUND_MM) / spacing.min())))
-    part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
-    return part, given, body.inside[box] & ~given, box
+def _mean_along(surface: BoolArray, known: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Mean of values that are known at some voxels of a surface, around each voxel; near 0 where few are known."""
+    of_all, share, total = (
+        gaussian_filter(of, sigma, mode="constant", truncate=_TRUNCATE)
+        for of in (surface.astype(np.float64), known.astype(np.float64), np.where(known, values, 0.0))
+    )
+    return np.asarray(total / np.maximum(np.maximum(share, _LEAST_SHARE * of_all), np.finfo(float).tiny))
 
 
 def _mean_around(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -> FloatArray:

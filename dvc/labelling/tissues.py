@@ -11,7 +11,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
 from dvc.images.bone_names import BONE, is_bones_name
-from dvc.images.bone_rim import bone_to_mean_rim
+from dvc.images.bone_rim import bone_to_rim
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import tissue_mask
@@ -74,7 +74,7 @@ def label_tissues(
     bone : Mask, optional
         The bone, on any grid of the image's frame. Its surface is moved along its normal, by up to 2.5 times the mean
         voxel edge, by its mean distance to the outer edge of the bone's dark rim in a neighbourhood of 6 mm. It stays
-        where the image shows no such rim.
+        where this is less than a fifth of a voxel, and where the image shows no such rim.
     body : Mask, optional
         The body. Default: found by an intensity threshold.
     marks : LabelMap, optional
@@ -121,7 +121,7 @@ def label_tissues(
     watch(0.1)
     even = fill_missing(without_bias_field(image))
     if known.any() and not bone_is_exact:
-        known = bone_to_mean_rim(even, Mask(grid, known), Mask(grid, whole)).inside
+        known = bone_to_rim(even, Mask(grid, known), Mask(grid, whole)).inside
         soft = whole & ~known
     watch(0.15)
     skin = Skin.of(even, Mask(grid, whole), known | image.missing)

@@ -48,7 +48,7 @@ STAGE = {
 """Every number that decides the result of this stage, for a record."""
 STAGE_AT_BONE = {
     "steps": _STEPS, "of_jumps": STAGE["of_jumps"], "distances": NUMBERS, "laplacians": _WITH_JUMPS,
-    "rim": OF_RIM | {"may_have_gaps": True},
+    "mean_rim": OF_RIM,
 }  # fmt: skip
 """The same where the bone is the only tissue that is known."""
 

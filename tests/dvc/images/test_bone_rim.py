@@ -1,14 +1,12 @@
-"""The surface of a bone is placed at its dark rim, voxel by voxel or on average, and stays where there is none."""
+"""The surface of a bone is moved to its dark rim, on average, and stays where there is none."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from dvc.images.bone_rim import bone_to_mean_rim, bone_to_rim
+from dvc.images.bone_rim import bone_to_rim
 from dvc.images.depth import depth_mm
 from dvc.images.image import Grid, Image, Mask
 
@@ -29,9 +27,9 @@ def ball(rim: np.ndarray, snr: float = 14.0) -> Image:
     return Image(GRID, np.abs(values + noise).astype(np.float32))
 
 
-def off_mm(image: Image, mask: np.ndarray, side: np.ndarray, to_rim: Callable = bone_to_rim) -> float:
+def off_mm(image: Image, mask: np.ndarray, side: np.ndarray) -> float:
     """How far the surface found lies from the true one on one side, root mean square, mm."""
-    found = to_rim(image, Mask(GRID, mask), Mask(GRID, BODY)).inside
+    found = bone_to_rim(image, Mask(GRID, mask), Mask(GRID, BODY)).inside
     true = depth_mm(BONE, GRID.spacing_mm)
     error = depth_mm(found, GRID.spacing_mm) - true
     return float(np.sqrt(np.mean(error[(np.abs(true) < 0.5) & side] ** 2)))
@@ -41,13 +39,13 @@ def off_mm(image: Image, mask: np.ndarray, side: np.ndarray, to_rim: Callable = 
 @pytest.mark.parametrize("rim", [EVERYWHERE, FROM_CENTRE[..., 0] > 0.0], ids=["all around", "half"])
 def test_the_surface_lies_at_the_rim_wherever_the_mask_was_drawn(drawn: np.ndarray, rim: np.ndarray) -> None:
     """A mask that is off by a voxel is off by .8 mm or more."""
-    assert off_mm(ball(rim), drawn, LEFT) < 0.25
+    assert off_mm(ball(rim), drawn, LEFT) < 0.3
 
 
 def test_a_surface_without_a_rim_stays() -> None:
     """Where the other half has one, it moved by 1 mm, as far as the darkest noise."""
     half, none = FROM_CENTRE[..., 0] > 0.0, np.zeros_like(BONE)
-    assert off_mm(ball(half), BONE, RIGHT) < 0.05
+    assert off_mm(ball(half), BONE, RIGHT) < 0.15
     assert off_mm(ball(none, snr=8.0), BONE, EVERYWHERE) == 0.0
 
 
@@ -60,29 +58,36 @@ def test_on_average_the_rim_moves_a_mask_that_is_off_and_keeps_an_exact_one(
     drawn: np.ndarray, at_most_mm: float, snr: float
 ) -> None:
     """Moved voxel by voxel, an exact mask is off by .1 mm."""
-    assert off_mm(ball(EVERYWHERE, snr), drawn, EVERYWHERE, bone_to_mean_rim) < at_most_mm
+    assert off_mm(ball(EVERYWHERE, snr), drawn, EVERYWHERE) < at_most_mm
+
+
+def test_a_mask_that_is_off_in_a_patch_is_moved_there_alone() -> None:
+    """By a mean over 6 mm alone, the patch was off by .7 mm."""
+    patch = FROM_CENTRE[..., 0] > 0.93 * RADIUS
+    drawn = BONE | (binary_dilation(BONE) & patch)
+    image = ball(EVERYWHERE)
+    assert off_mm(image, drawn, FROM_CENTRE[..., 0] > 0.96 * RADIUS) < 0.4
+    assert off_mm(image, drawn, ~patch) < 0.2
 
 
 def test_a_mask_that_lies_a_voxel_aside_is_moved_back() -> None:
     """It was off by .58 mm."""
-    assert off_mm(ball(EVERYWHERE), np.roll(BONE, 1, axis=0), EVERYWHERE, bone_to_mean_rim) < 0.25
+    assert off_mm(ball(EVERYWHERE), np.roll(BONE, 1, axis=0), EVERYWHERE) < 0.25
 
 
 @pytest.mark.parametrize("drawn", [BONE, binary_dilation(BONE), binary_erosion(BONE)], ids=["exact", "large", "small"])
 @pytest.mark.parametrize("cosine", [0.95, 0.9])
 def test_tendon_at_the_bone_is_not_taken_for_its_rim(drawn: np.ndarray, cosine: float) -> None:
-    """A cone as dark as the rim, from the bone to the surface of the body; a surface of its own moves into it by .6 mm
-    and more."""
+    """A cone as dark as the rim, from the bone to the surface of the body. Voxel by voxel, the bone grew into it."""
     tendon = (FROM_CENTRE[..., 2] > cosine * RADIUS) & BODY
     image = Image(GRID, np.where(tendon & ~BONE, 0.15, ball(EVERYWHERE).values))
     at = tendon & (RADIUS > 12.0)
-    assert off_mm(image, drawn, at, bone_to_mean_rim) < 0.3
-    assert off_mm(image, drawn, at) > 0.5
+    assert off_mm(image, drawn, at) < 0.3
 
 
 def test_on_average_a_surface_far_from_every_rim_stays() -> None:
     large, half, none = binary_dilation(BONE), FROM_CENTRE[..., 0] > 0.0, np.zeros_like(BONE)
-    assert off_mm(ball(none, snr=8.0), BONE, EVERYWHERE, bone_to_mean_rim) == 0.0
-    found = bone_to_mean_rim(ball(half), Mask(GRID, large), Mask(GRID, BODY)).inside
+    assert off_mm(ball(none, snr=8.0), BONE, EVERYWHERE) == 0.0
+    found = bone_to_rim(ball(half), Mask(GRID, large), Mask(GRID, BODY)).inside
     assert np.array_equal(found[:10], large[:10])  # 14 mm from the nearest rim
     assert np.count_nonzero(found[24:] ^ BONE[24:]) < 0.4 * np.count_nonzero(large[24:] ^ BONE[24:])

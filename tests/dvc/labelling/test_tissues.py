@@ -1,8 +1,10 @@
 """Tissues found in images: layers and balls whose place is known, and a heel whose every voxel is."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
 
 from dvc import Grid, Image, Mask, TissueLabels, label_tissues
 from dvc.arrays import BoolArray, FloatArray
@@ -164,6 +166,21 @@ def test_tissues_of_a_heel(labelled) -> None:
     assert dice(made.labels.region("muscle").inside, known["muscle"] | known["tendon"]) > 0.93
     assert dice(made.labels.region("skin").inside, known["skin"]) > 0.83
     assert dice(made.labels.region("other bone").inside, known["ankle"]) > 0.93
+
+
+@pytest.mark.parametrize("off", [binary_dilation, binary_erosion])
+def test_labels_hardly_depend_on_how_large_the_bone_was_drawn(labelled, off: Callable[[BoolArray], BoolArray]) -> None:
+    """If the surface stayed at a mask that is a voxel off, 2.4 and 2.9 % of the labels would be others."""
+    made, truth = labelled
+    heel, grid = Heel(31), heel_grid(1.2)
+    image, bone = scan(heel, grid, snr=25.0, number=0), truth.region("bone")
+    mask = Mask(grid, off(bone.inside))
+    again = label_tissues(image, mask).labels
+    assert dice(mask.inside, bone.inside) < 0.92
+    assert dice(again.region("bone").inside, bone.inside) > 0.98
+    inside = truth.labels > 0
+    assert np.mean(again.labels[inside] == made.labels.labels[inside]) > 0.995
+    assert np.array_equal(label_tissues(image, mask, bone_is_exact=True).labels.region("bone").inside, mask.inside)
 
 
 def test_probabilities_are_as_sure_as_they_are_right(labelled) -> None:

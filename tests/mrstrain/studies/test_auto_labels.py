@@ -12,6 +12,7 @@ from scipy.ndimage import binary_erosion
 import mrstrain
 from dvc import Mask, read_labels, write_image, write_mask
 from dvc.errors import InputError
+from mrstrain.studies.file import read_study
 from mrstrain.studies.run import forecast, run
 from tests.processes import stages_run_here
 
@@ -58,6 +59,25 @@ def test_the_label_map_is_made_and_measured_with(study):
     assert f"{100 * unsure:.0f} % of its voxels have an uncertain label" in page
 
 
+def test_the_bone_is_that_of_the_label_map_and_not_its_mask(study):
+    """The interface would else be where the mask was drawn."""
+    assert_bone_of_labels(study / "results" / "registration" / "Load1")
+    assert "bone" in json.loads((study / "results" / "labels" / "tissues.json").read_text())["inputs"]
+
+
+def assert_bone_of_labels(case: Path) -> None:
+    record = json.loads((case / "provenance.json").read_text())
+    assert record["parameters"]["bone_label"] == "bone"
+    assert "bone" not in record["inputs"]
+
+
+def test_beside_labels_of_another_program_the_bone_is_its_mask(tmp_path):
+    command = 'labels = "auto"\nlabels_command = "segment {image} {labels}"'
+    (tmp_path / "study.toml").write_text(STUDY.replace('labels = "auto"', command))
+    files = read_study(tmp_path).subject_files
+    assert (files.bone, files.bone_label) == (tmp_path / "calcaneus.nii.gz", None)
+
+
 def test_a_study_without_models_begins_with_the_strain_in_a_picture(study):
     first = (study / "results" / "report.html").read_text().split('<details id="part-')[1]
     assert "<h2>Measured strain</h2>" in first
@@ -84,6 +104,7 @@ def test_a_series_makes_its_label_map_as_a_study_does(study, tmp_path, in_this_p
     own = read_labels(tmp_path / "out" / "labels" / "tissues.nii.gz", tmp_path / "out" / "labels" / "tissues.csv")
     made = study / "results" / "labels"
     assert np.array_equal(own.labels, read_labels(made / "tissues.nii.gz", made / "tissues.csv").labels)
+    assert_bone_of_labels(tmp_path / "out" / "Load1")
     assert [section.title for section in (series.cases[0].section,)] == ["Load1"]
     assert "Label map made from the image" in (tmp_path / "out" / "report.html").read_text()
 
