@@ -22,7 +22,7 @@ _RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are sma
 _ONE_VOXEL = 1.05
 _LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no surface
 _MEAN_MM, _LOCAL = 6.0, 1.25  # mm and voxels: standard deviations of two means of the distance to the rim
-_LEAST, _LEAST_LOCAL = 0.2, 0.375  # voxels: smaller means are noise
+_LEAST, _LEAST_LOCAL = 0.2, 0.5  # voxels: smaller means are noise
 _CLEAR, _CLEAR_LOCAL = 1.0, 2.0  # reaches from where the dark goes on: nearer distances are left out of the means
 _LEAST_SHARE = 0.1  # of the surface there that shows a rim: below, the distance tends to zero
 NUMBERS = {
@@ -39,48 +39,49 @@ def reach_of(spacing_mm: FloatArray) -> float:
 
 
 def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
-    """The bone of a mask, with its surface moved to its dark rim; see `bones_to_rims`.
+    """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
 
-    The surface also stays where nothing within reach is as dark as a rim. ``image`` has no bias field; the bone and the
-    ``body``, bone included, are on its grid.
+    The distance is averaged along the surface in a neighbourhood of 6 mm (standard deviation), which corrects a mask
+    that is too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects what is off in
+    patches. The surface moves only where a mean is at least .2 and .5 voxels: an exact mask stays, which noise would
+    change if each voxel went to the rim, as in `bones_to_rims`. Where the image shows no rim, and where the dark goes
+    on beyond it, as in tendon, the distance is that of the neighbourhood; it is zero where a rim is far. ``image`` has
+    no bias field; the bone and the ``body``, bone included, are on its grid.
     """
     spacing = image.grid.spacing_mm
-    box = bone.box(int(np.ceil((reach_of(spacing) + _TRUNCATE * _AROUND_MM) / spacing.min())))
+    reach_mm, edge_mm = reach_of(spacing), float(spacing.mean())
+    box = bone.box(int(np.ceil((reach_mm + _TRUNCATE * _AROUND_MM) / spacing.min())))
     part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
+    rims = _Rims.of(part.values, given, body.inside[box] & ~given, spacing, rims_have_gaps=True)
+    clear_mm = np.full(given.shape, np.inf)
+    if rims.goes_on.any():
+        clear_mm = distance_transform_edt(~rims.goes_on, sampling=spacing)
+    depth, depth_of_rim = (depth_mm(of, spacing) for of in (given, np.where(rims.seen, rims.found, given)))
+    for around_mm, least, clear in ((_MEAN_MM, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
+        surface = rims.near & (np.abs(depth) < 0.5 * edge_mm)
+        known = surface & rims.seen & (clear_mm > clear * reach_mm)
+        off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
+        depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)
     found = bone.inside.copy()
-    found[box] = bones_to_rims(part.values, given, body.inside[box] & ~given, (), spacing, rims_have_gaps=True)
+    found[box] = np.where(rims.near & ~rims.core, depth > 0.0, given)
     return Mask(bone.grid, found)
 
 
 def bones_to_rims(
-    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray, *,
-    rims_have_gaps: bool = False,
-) -> BoolArray:  # fmt: skip
-    """Bones (ni, nj, nk) whose surfaces are moved by their mean distance to the outer edge of their dark rims.
+    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray
+) -> BoolArray:
+    """Bones (ni, nj, nk) whose surfaces lie within reach of those given, at the outer edge of their dark rims.
 
-    The distance is averaged along the surface in a neighbourhood of 6 mm (standard deviation), which corrects bones
-    that are too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects what is off in
-    patches. A surface moves only where a mean is at least .2 and .375 voxels: exact bones stay, which noise would
-    change if each voxel went to the rim. Where the image shows no rim, beside those of the ``tissues`` that are as dark
-    as one, and where the dark goes on beyond the rim, as in tendon, the distance is that of the neighbourhood; it is
-    zero where a rim is far. ``values`` are of an image without its bias field and without missing voxels, ``soft`` is
-    soft tissue. If ``rims_have_gaps``, a rim is shown only within reach of something that dark.
+    Where the image shows no such edge with the brighter ``soft`` tissue, and beside those of the ``tissues`` that are
+    as dark as a rim, such as tendon, surfaces stay. ``values`` are of an image without its bias field and without
+    missing voxels.
     """
-    rims = _Rims.of(values, given, soft, spacing_mm, rims_have_gaps=rims_have_gaps)
-    reach_mm, edge_mm, seen = reach_of(spacing_mm), float(spacing_mm.mean()), rims.seen
+    rims = _Rims.of(values, given, soft, spacing_mm, rims_have_gaps=False)
+    seen = rims.seen
     for tissue in tissues:
         if float(np.median(rims.blurred[tissue])) < _LEAST_STEP * rims.dark:
-            seen = seen & (distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_mm)
-    clear_mm = np.full(given.shape, np.inf)
-    if rims.goes_on.any():
-        clear_mm = distance_transform_edt(~rims.goes_on, sampling=spacing_mm)
-    depth, depth_of_rim = (depth_mm(of, spacing_mm) for of in (given, np.where(seen, rims.found, given)))
-    for around_mm, least, clear in ((_MEAN_MM, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
-        surface = rims.near & (np.abs(depth) < 0.5 * edge_mm)
-        known = surface & seen & (clear_mm > clear * reach_mm)
-        off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing_mm)
-        depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)
-    return np.where(rims.near & ~rims.core, depth > 0.0, given)
+            seen = seen & (distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_of(spacing_mm))
+    return np.where(seen, rims.found, given)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +100,7 @@ class _Rims:
     def of(
         cls, values: Float32Array, given: BoolArray, soft: BoolArray, spacing_mm: FloatArray, *, rims_have_gaps: bool
     ) -> Self:
-        """Rims of the bones given; parameters as in `bones_to_rims`.
+        """Rims of the bones given. If rims have gaps, a surface that is farther than the reach from one shows none.
 
         From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim.
         A bone gets the rest of the rim, up to the edge with the brighter soft tissue.

@@ -161,7 +161,7 @@ def test_tissues_of_a_heel(labelled) -> None:
     assert made.notes == ()
     assert dict(made.labels.names) == {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
     known = {name: truth.region(name).inside for name in truth.names.values()}
-    assert np.array_equal(made.labels.region("bone").inside, known["bone"])
+    assert dice(made.labels.region("bone").inside, known["bone"]) > 0.998
     assert dice(made.labels.region("fat").inside, known["fat"]) > 0.93
     assert dice(made.labels.region("muscle").inside, known["muscle"] | known["tendon"]) > 0.93
     assert dice(made.labels.region("skin").inside, known["skin"]) > 0.83
