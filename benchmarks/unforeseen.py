@@ -282,7 +282,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--heels", type=int, nargs="+", help="only make the pairs of these heels")
-    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=ENGINES)
+    with_bars = [engine for engine in ENGINES if error_model_of(engine) is not None]
+    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=with_bars)
     parser.add_argument("--untouched", action="store_true", help="the motions that no error model may see")
     parser.add_argument("--out", type=Path, help="results of other engines in this file are kept")
     parser.add_argument("--widen", type=Path, help="folder of an accuracy study")
@@ -296,14 +297,14 @@ def main() -> None:
     if given.out is None:
         return
     result = json.loads(given.out.read_text()) if given.out.is_file() else {}
-    result["versions"] = versions()
     for engine in given.engines:
         runs, model = measured(given.work, of(engine)), error_model_of(engine)
-        assert model is not None
+        if model is None:
+            parser.error(f"{engine} has no error model; make it first, with --widen")
         figures = coverage_rows(runs, model) if given.untouched else figures_of(runs, model)
-        result[engine] = held(runs, model, figures)
+        result[engine] = {"versions": versions()} | held(runs, model, figures)
         print(engine, json.dumps(result[engine], indent=1))
-    given.out.write_text(json.dumps(result, indent=1) + "\n")
+        given.out.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ def regression_told(rows: Sequence[Agreement], model: str) -> str:
         slope, r2 = (over_loads(rows, model, quantity, value) for value in ("slope", "r2"))
         told += [f"{name} slope {slope}, R² {r2}"] if slope else []
     several = " over the loads" * (len({row.load for row in rows if row.model == model}) > 1)
-    means = "Equal fields: 1 and 1. Strain elsewhere than measured: R² near 0."
+    means = "Equal fields: 1 and 1. If the strain is in other places than measured, R² is near 0."
     return f"Cell by cell, {model} on the measurement: {'; '.join(told)}{several}. {means}" if told else ""
 
 

@@ -22,6 +22,8 @@ _RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are sma
 _ONE_VOXEL = 1.05
 _LEAST_STEP = 1.3  # brightness beside a rim over that of the rim: below, the image shows no surface
 _MEAN_MM, _LOCAL = 6.0, 1.25  # mm and voxels: standard deviations of two means of the distance to the rim
+_OF_DEEPEST = 0.5  # of the bone's greatest depth: the first mean is not of its other side, too
+_THICKEST = 2.1  # over the thinnest voxel edge: in thicker slices, rims are not seen in all directions
 _LEAST, _LEAST_LOCAL = 0.2, 0.5  # voxels: smaller means are noise
 _CLEAR, _CLEAR_LOCAL = 1.0, 2.0  # reaches from where the dark goes on: nearer distances are left out of the means
 _LEAST_SHARE = 0.1  # of the surface there that shows a rim: below, the distance tends to zero
@@ -29,6 +31,7 @@ NUMBERS = {
     "reach": _REACH, "blur_mm": _BLUR_MM, "around_mm": _AROUND_MM, "dark_percent": _DARK_PERCENT, "edge": _EDGE,
     "rim_mm": _RIM_MM, "one_voxel": _ONE_VOXEL, "least_step": _LEAST_STEP, "mean": [_MEAN_MM, _LEAST, _CLEAR],
     "local_mean": [_LOCAL, _LEAST_LOCAL, _CLEAR_LOCAL], "least_share": _LEAST_SHARE,
+    "of_deepest": _OF_DEEPEST, "thickest": _THICKEST,
 }  # fmt: skip
 """Every number that determines where a surface is moved to, for a record."""
 
@@ -41,14 +44,17 @@ def reach_of(spacing_mm: FloatArray) -> float:
 def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
 
-    The distance is averaged along the surface in a neighbourhood of 6 mm (standard deviation), which corrects a mask
-    that is too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects what is off in
-    patches. The surface moves only where a mean is at least .2 and .5 voxels: an exact mask stays, which noise would
-    change if each voxel went to the rim, as in `bones_to_rims`. Where the image shows no rim, and where the dark goes
-    on beyond it, as in tendon, the distance is that of the neighbourhood; it is zero where a rim is far. ``image`` has
-    no bias field; the bone and the ``body``, bone included, are on its grid.
+    The distance is averaged on the surface in a neighbourhood of 6 mm (standard deviation; less in a thin bone), which
+    corrects a mask that is too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects
+    what is off in patches. The surface moves only where a mean is at least .2 and .5 voxels: an exact mask stays, which
+    noise would change if each voxel went to the rim, as in `bones_to_rims`. Where the image shows no rim, and where the
+    dark goes on beyond it, as in tendon, the distance is that of the neighbourhood; it is zero where a rim is far. In
+    slices more than 2.1 times as thick as the other voxel edges, the surface stays. ``image`` has no bias field; the
+    bone and the ``body``, bone included, are on its grid.
     """
     spacing = image.grid.spacing_mm
+    if spacing.max() > _THICKEST * spacing.min():
+        return bone
     reach_mm, edge_mm = reach_of(spacing), float(spacing.mean())
     box = bone.box(int(np.ceil((reach_mm + _TRUNCATE * _AROUND_MM) / spacing.min())))
     part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
@@ -57,8 +63,9 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     if rims.goes_on.any():
         clear_mm = distance_transform_edt(~rims.goes_on, sampling=spacing)
     depth, depth_of_rim = (depth_mm(of, spacing) for of in (given, np.where(rims.seen, rims.found, given)))
-    for around_mm, least, clear in ((_MEAN_MM, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
-        surface = rims.near & (np.abs(depth) < 0.5 * edge_mm)
+    mean_mm = min(_MEAN_MM, _OF_DEEPEST * float(depth.max()))
+    for around_mm, least, clear in ((mean_mm, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
+        surface = rims.near & (np.abs(depth) < 0.55 * edge_mm)  # beside a plane: 0.52
         known = surface & rims.seen & (clear_mm > clear * reach_mm)
         off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
         depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)

@@ -20,6 +20,7 @@ from dvc.labelling.bones import bones_in
 from dvc.labelling.brightness import Levels, brighter_share, two_levels
 from dvc.labelling.marks import corrected, grown
 from dvc.labelling.skin import Skin
+from dvc.registration.bone_mask import mask_doubt
 
 NAMES = {1: BONE, 2: "fat", 3: "muscle", 4: "skin", 5: "other bone"}
 """Numbers and names of the tissues that can be found without marks."""
@@ -120,7 +121,9 @@ def label_tissues(
     whole = whole | known
     watch(0.1)
     even = fill_missing(without_bias_field(image))
+    doubt = ""
     if known.any() and not bone_is_exact:
+        doubt = mask_doubt(image, Mask(grid, known), Mask(grid, whole))
         known = bone_to_rim(even, Mask(grid, known), Mask(grid, whole)).inside
         soft = whole & ~known
     watch(0.15)
@@ -130,7 +133,7 @@ def label_tissues(
         soft = soft & binary_fill_holes(~image.missing)
         whole = soft | known
     marked, outside = _in_soft_tissue(marked, soft, known)
-    chance, notes = {BONE: known.astype(np.float32)} if known.any() else {}, list[str]()
+    chance, notes = {BONE: known.astype(np.float32)} if known.any() else {}, [doubt] if doubt else []
     left = soft.astype(np.float32)  # probability that is not given to a tissue yet
     if skin is None:
         notes.append("No skin was found: the image shows no darker layer at the surface of the body.")

@@ -13,6 +13,7 @@ from mrstrain.measurement.engines import ELASTIX, GAUSS_NEWTON
 from mrstrain.options.measurement import EngineOptions, SubjectFiles
 from mrstrain.options.model import Options
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, Directions
+from mrstrain.records.inputs import made_from_image
 from mrstrain.records.measured_with import MeasuredWith
 
 _F = TypeVar("_F", bound=SubjectFiles)
@@ -34,7 +35,8 @@ def fill_labels(given: ComparisonLabels, loads: Sequence[ResultFolder]) -> Compa
             f"{record.path}: the measurement was made without a label map, and a comparison needs one. Give that of "
             "the unloaded image as labels (--labels)."
         )
-    bone = record.parameters.get("bone_label")
+    # A label map that was made from the image may have other bones beside that of the alignment.
+    bone = record.parameters.get("bone_label") if made_from_image(labels) is None else None
     bones = given.bones or (() if bone is None else (str(bone),))
     return given.model_copy(update={"labels": labels, "names": given.names or record.file("names"), "bones": bones})
 

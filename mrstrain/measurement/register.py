@@ -88,6 +88,7 @@ def register(
         For any input that cannot be used, before anything is computed; or if every load failed.
     """
     target = Path(out)
+    drawn = {"drawn_bone": [subject_files.bone]} if subject_files.labels == AUTO and subject_files.bone else {}
     load0, places = Path(load0), _places([Path(p) for p in loads], scans)
     cases, paths = list(places), list(places.values())
     subject_files.refuse_missing()
@@ -147,6 +148,7 @@ def register(
         settings = Settings(chosen, align, running.seed, threads)
         model = model or error_model_of(chosen.name)
         files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}, **strokes.files}
+        files |= drawn
         more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
         more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
         more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}

@@ -250,9 +250,9 @@ def _slices(folder: Path) -> list[str]:
     try:
         files = sorted(p for p in folder.iterdir() if p.is_file())
         bare = [p for p in files if not p.suffix][:_LOOKED_AT]  # IM0001
-        return [
-            p.name for p in files if (p.suffix.lower() == ".dcm" and not _is_volume(p)) or (p in bare and is_dicom(p))
-        ]
+        single = [p for p in files if p.suffix.lower() == ".dcm" and not _is_volume(p)]
+        single += [p for p in bare if is_dicom(p) and not is_multiframe(p)]
+        return [p.name for p in sorted(single)]
     except OSError:  # unreadable, so of no use
         return []
 

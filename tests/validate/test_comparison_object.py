@@ -187,7 +187,7 @@ def test_slope_and_r2_of_the_best_match_are_told_at_once(comparison: Comparison,
     page, summary = (folder / "report.html").read_text(), comparison.summary()
     first = summary.index(comparison.ranking.statements[0])
     assert summary[first + 1].startswith(told)
-    assert "Equal fields: 1 and 1. Strain elsewhere" in summary[first + 1]
+    assert "Equal fields: 1 and 1. If the strain is in other places" in summary[first + 1]
     before, picture = page.index(told), page.index("<figure")
     assert before < picture
     assert page.index(comparison.ranking.statements[0]) < before

@@ -183,6 +183,14 @@ def test_labels_hardly_depend_on_how_large_the_bone_was_drawn(labelled, off: Cal
     assert np.array_equal(label_tissues(image, mask, bone_is_exact=True).labels.region("bone").inside, mask.inside)
 
 
+def test_a_mask_that_is_mirrored_is_told(labelled) -> None:
+    """Its surface was moved to edges of the image before the registration judged it."""
+    heel, grid = Heel(31), heel_grid(1.2)
+    image, bone = scan(heel, grid, snr=25.0, number=0), labelled[1].region("bone")
+    notes = label_tissues(image, Mask(grid, bone.inside[::-1])).notes
+    assert any("The bone mask may be mirrored" in note for note in notes)
+
+
 def test_probabilities_are_as_sure_as_they_are_right(labelled) -> None:
     made, truth = labelled
     total = made.probability.sum(axis=0)

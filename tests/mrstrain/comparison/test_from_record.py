@@ -20,7 +20,7 @@ from mrstrain.comparison.from_record import (
 from mrstrain.options.measurement import EngineOptions, SubjectFiles
 from mrstrain.options.modelling import ComparisonDirections, ComparisonLabels, Directions
 from mrstrain.records.measured_with import MeasuredWith
-from mrstrain.records.provenance import provenance
+from mrstrain.records.provenance import file_hash, provenance
 
 ROLES = {"load0": "Load0.nii.gz", "labels": "tissues.nii.gz", "names": "tissues.csv", "bone": "bone.nii.gz"}
 
@@ -55,6 +55,15 @@ def test_the_label_map_comes_with_its_names_and_its_bone(folder: Path) -> None:
     assert found == ComparisonLabels(**own)
     for field, value in (("names", folder / "other.csv"), ("bones", ("calcaneus", "talus"))):
         assert fill_labels(ComparisonLabels(**{field: value}), [load]) == ComparisonLabels(**(own | {field: value}))
+
+
+def test_a_label_map_made_from_the_image_may_have_other_bones(folder: Path) -> None:
+    """With the bone of the alignment alone, other bones would count as soft tissue."""
+    load = measured(folder, "labels", "names", bone_label="bone")
+    made = {"command": "label", "labels_sha256": file_hash(folder / "tissues.nii.gz"), "uncertain": 0.1, "notes": []}
+    (folder / "tissues.json").write_text(json.dumps(made))
+    assert fill_labels(ComparisonLabels(), [load]).bones == ()
+    assert fill_labels(ComparisonLabels(bones=("bone",)), [load]).bones == ("bone",)
 
 
 def test_another_label_map_has_its_own_names_and_bone(folder: Path) -> None:

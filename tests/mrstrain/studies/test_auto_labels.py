@@ -105,6 +105,8 @@ def test_a_series_makes_its_label_map_as_a_study_does(study, tmp_path, in_this_p
     made = study / "results" / "labels"
     assert np.array_equal(own.labels, read_labels(made / "tissues.nii.gz", made / "tissues.csv").labels)
     assert_bone_of_labels(tmp_path / "out" / "Load1")
+    record = json.loads((tmp_path / "out" / "Load1" / "provenance.json").read_text())
+    assert "calcaneus.nii.gz" in str(record["inputs"]["drawn_bone"])
     assert [section.title for section in (series.cases[0].section,)] == ["Load1"]
     assert "Label map made from the image" in (tmp_path / "out" / "report.html").read_text()
 
