@@ -73,9 +73,10 @@ def label_tissues(
         Unloaded image, such as a T1- or proton-density-weighted one, where fat is brighter than muscle and skin. Where
         it ends in missing voxels, nothing is labelled; holes in it are.
     bone : Mask, optional
-        The bone, on any grid of the image's frame. Its surface is moved along its normal, by up to 2.5 times the mean
-        voxel edge, by its mean distance to the outer edge of the bone's dark rim in a neighbourhood of 6 mm. It stays
-        where this is less than a fifth of a voxel, and where the image shows no such rim.
+        The bone, on any grid of the image's frame. Its surface is moved, by up to 2.5 times the mean voxel edge, by its
+        mean distance to the outer edge of the bone's dark rim: in a neighbourhood of 6 mm and then, where it is still
+        off by half a voxel, of 1.25 voxels. It stays where this is less than a fifth of a voxel, where the image shows
+        no such rim, and in slices more than 2.1 times as thick as the other voxel edges.
     body : Mask, optional
         The body. Default: found by an intensity threshold.
     marks : LabelMap, optional
