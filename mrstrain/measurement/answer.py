@@ -46,8 +46,8 @@ def measured_strain(
 ) -> list[Section]:
     """The first part of a report, from the sections of the loads; its figure is also written into ``out``.
 
-    ``folders`` are those of the loads' results, by load; empty if there is none. `most_strained` is
-    told by the banner of the report, or else by its first paragraph.
+    ``folders`` are those of the loads' results, by load; empty if there is none. `most_strained` is told by
+    the banner of the report, or else by its first paragraph.
     """
     if not folders:
         return []

@@ -30,9 +30,8 @@ def answer_of(
 ) -> list[Section]:
     """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
 
-    Its table has a row for each load and tissue: the measured maximum shear
-    strain, and the best match. Without a comparison it has ``pictures`` of the measured strain; with one, its areas
-    are folded.
+    Its table has a row for each load and tissue: the measured maximum shear strain, and the best match. Without a
+    comparison it has ``pictures`` of the measured strain; with one, its areas are folded.
     """
     table = table_of_loads(measured)
     if not compared:

@@ -182,7 +182,7 @@ def test_slope_and_r2_of_the_best_match_are_told_at_once(comparison: Comparison,
     rows = [a for a in comparison.agreements if (a.model, a.quantity, a.part) == (best, "u_mm", ALL)]
     slope, r2 = (" to ".join(dict.fromkeys(f"{end(getattr(a, of) for a in rows):.2f}" for end in (min, max)))
                  for of in ("slope", "r2"))  # fmt: skip
-    told = f"Cell by cell, {best} on the measurement: displacement slope {slope}, R² {r2}"
+    told = f"Cell by cell, {best} (best by area) on the measurement: displacement slope {slope}, R² {r2}"
     assert slope != r2
     page, summary = (folder / "report.html").read_text(), comparison.summary()
     first = summary.index(comparison.ranking.statements[0])

@@ -52,8 +52,8 @@ class ImagePair:
 
     Components of the displacement, and control points, are along the axes of `fixed`. Normal matrices, gain and strain
     are held by blocks of so many voxels along each axis. Nearer than `rim_mm` to its ends and gaps the moving image is
-    not used: blurred there, it shows what lies beyond. With `interfaces`, strain is taken at the
-    first voxel of each block, which lies in one tissue; without, at the block's centre.
+    not used: blurred there, it shows what lies beyond. With `interfaces`, strain is taken at the first voxel
+    of each block, which lies in one tissue; without, at the block's centre.
     """
 
     def __init__(
