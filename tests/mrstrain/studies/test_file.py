@@ -140,7 +140,8 @@ def test_labels_from_the_image_come_before_all_that_reads_them(tmp_path):
         assert "label" in stages[name].after, name
         assert stages[name].arguments["labels"] == made, name
         assert made not in stages[name].files, name
-    assert stages["register Load1"].arguments["bone_label"] is None  # the bone is that of the mask
+    registered = stages["register Load1"].arguments
+    assert (registered["bone"], registered["bone_label"]) == (None, "bone")  # of the label map, not the mask
     other = read_study(written(tmp_path, text + '[mesh]\nlabels = "cut.nii.gz"\n'))
     assert {stage.name: stage for stage in plan(other)}["mesh"].after == ()
 
