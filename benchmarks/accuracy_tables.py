@@ -23,8 +23,8 @@ TISSUES = ("fat", "muscle", "skin", "bone")
 USUAL = ("0.8", 25.0)
 CONDITIONS = (("0.8", 12.0), USUAL, ("0.8", 50.0), ("0.8 x 0.8 x 1.6", 25.0), ("1.2", 25.0))
 TO_BONE = "distance to bone, mm"
-LABEL_MAPS = "label-maps"
-"""Folder of the registrations with label maps that are right, too large and too small, each under every motion."""
+LABEL_MAPS, BONE_MASKS = "label-maps", "bone-masks"
+"""Folders of the registrations with masks that are right, too large and too small, each under every motion."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,8 @@ def of_engines(own: Results, other: Results) -> None:
     )
 
 
-def of_borders(one: Results, borders: Results, each: Results) -> None:
-    """With label maps beside without; ``each`` of them at one condition, and ``borders`` in turn at all."""
+def of_borders(one: Results, borders: Results, each: Results, masks: Results) -> None:
+    """With label maps beside without; ``each`` of them at one condition, and ``borders`` in turn at all; bone masks."""
     places = [("fat", None), ("fat", 0.0), ("fat", 1.5), ("muscle", None), ("skin", None), ("bone", None)]
     head = ("fat", "within 1.5 mm of bone", "from 1.5 to 3 mm", "muscle", "skin", "bone", "u")
 
@@ -193,16 +193,17 @@ def of_borders(one: Results, borders: Results, each: Results) -> None:
             told(results.error("fat", motions, condition, None, off, "u_rmse_mm")),
         ]
 
-    ways = (("one spline", one, None), ("right", each, 0), ("too large", each, 1), ("too small", each, -1))
-    show(
-        "With label maps, 0.8 mm, SNR 25",
-        ("motion", "labels", *head),
-        (
-            [", ".join(motions), way, *row(results, off, motions, USUAL)]
-            for motions in (*([m] for m in STRAINED), STRAINED)
-            for way, results, off in ways
-        ),
-    )
+    for what, of in (("bone masks", masks), ("label maps", each)):
+        ways = (("one spline", one, None), ("right", of, 0), ("too large", of, 1), ("too small", of, -1))
+        show(
+            f"With {what}, 0.8 mm, SNR 25",
+            ("motion", what, *head),
+            (
+                [", ".join(motions), way, *row(results, off, motions, USUAL)]
+                for motions in (*([m] for m in STRAINED), STRAINED)
+                for way, results, off in ways
+            ),
+        )
     show(
         "Bias in fat within 1.5 mm of bone",
         ("motion", "one spline", "labels right"),
@@ -232,7 +233,7 @@ def main() -> None:
     given = parser.parse_args()
     own, other, borders = (Results(given.results / n) for n in ("gauss-newton", "heel-mr", "gauss-newton-borders"))
     of_engines(own, other)
-    of_borders(own, borders, Results(given.results / LABEL_MAPS))
+    of_borders(own, borders, Results(given.results / LABEL_MAPS), Results(given.results / BONE_MASKS))
     show(
         "Voxels whose truth lies within 1.96 standard deviations: mean, least, most",
         ("voxel, SNR", "gauss-newton", "heel-mr", "borders"),

@@ -1,6 +1,7 @@
-"""Error with label maps that are right, too large and too small, each of them under every motion.
+"""Error with label maps, or bone masks, that are right, too large and too small, each of them under every motion.
 
     python -m benchmarks.label_maps --work DIR --out benchmarks/results/accuracy/label-maps
+    python -m benchmarks.label_maps --work DIR2 --engine gauss-newton-bone --out benchmarks/results/accuracy/bone-masks
 
 The accuracy study combines each motion with one of the three, in turn. Here all are combined, on the heels that nothing
 is tuned on (0.8 mm, SNR 25): 42 registrations, 20 minutes on two cores.
@@ -18,16 +19,18 @@ from phantoms import AccuracyCase
 MOTIONS = ("still", "smooth", "sliding", "Load1", "Load2", "Load3", "Load4")
 SEEDS = 9000, 9001
 LABELS_OFF = 0, 1, -1
+ENGINES = "gauss-newton-borders", "gauss-newton-bone"
 KEPT = "errors.csv", "runs.csv", "zero_strain.csv"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     cases = [
-        AccuracyCase("gauss-newton-borders", (0.8, 0.8, 0.8), 25.0, motion, seed, off)
+        AccuracyCase(given.engine, (0.8, 0.8, 0.8), 25.0, motion, seed, off)
         for off in LABELS_OFF
         for motion in MOTIONS
         for seed in SEEDS

@@ -21,24 +21,25 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import dvc
-from benchmarks.accuracy_tables import CONDITIONS, LABEL_MAPS, USUAL, Results
+from benchmarks.accuracy_tables import BONE_MASKS, CONDITIONS, LABEL_MAPS, USUAL, Results
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
 IMAGES = HERE.parent / "docs" / "images" / "benchmarks"
 TISSUES = ("fat", "muscle", "skin", "bone")
 plt.style.use(dvc.FIGURE_STYLE)
-OURS, ELASTIX, LABELS = plt.rcParams["axes.prop_cycle"].by_key()["color"][:3]
+OURS, ELASTIX, LABELS, ONE_SPLINE = plt.rcParams["axes.prop_cycle"].by_key()["color"][:4]
 OTHERS = "#7d8894"
-MARKERS = {OURS: "o-", ELASTIX: "^-", LABELS: "s-"}
+MARKERS = {OURS: "o-", ELASTIX: "^-", LABELS: "s-", ONE_SPLINE: "D-"}
 ENGINES = {
-    "gauss-newton": ("default engine", OURS),
+    "gauss-newton-bone": ("bone mask alone", OURS),
     "gauss-newton-borders": ("with a label map", LABELS),
+    "gauss-newton": ("one smooth spline", ONE_SPLINE),
     "heel-mr": ("elastix (heel-mr)", ELASTIX),
 }
 PEERS = {
-    "gauss-newton": "mrstrain", "gauss-newton-borders": "mrstrain with a label map", "heel-mr": "mrstrain with elastix",
-    "elastix default, as acquired": "elastix, defaults",
+    "gauss-newton-bone": "mrstrain", "gauss-newton-borders": "mrstrain with a label map",
+    "heel-mr": "mrstrain with elastix", "elastix default, as acquired": "elastix, defaults",
 }  # fmt: skip
 SETS = ("trebbi", "zwam", "erdemir", "akrami", "luboz")
 MOTIONS = {
@@ -69,7 +70,7 @@ def peers() -> Figure:
     runs = [run for run in read("peers")["runs"] if run["status"] == "done"]
     errors = {
         peer: [mean(run["tissues"][t]["shear_rmse"] for run in runs if run["peer"] == peer) for t in TISSUES]
-        for peer in {run["peer"] for run in runs} - {"elastix default"}
+        for peer in {run["peer"] for run in runs} - {"elastix default", "gauss-newton"}
     }
     figure, axes = panels(len(TISSUES), 3.6)
     order = sorted(errors, key=lambda peer: errors[peer][0], reverse=True)
@@ -91,8 +92,8 @@ def error() -> Figure:
     names[3] = "0.8, 0.8,\n1.6 mm"
     names[4] = "1.2 mm"
     for one, tissue in zip(axes, ("fat", "muscle", "skin"), strict=True):
-        for engine, (label, colour) in ENGINES.items():
-            results = Results(RESULTS / "accuracy" / engine)
+        for engine in ("gauss-newton", "gauss-newton-borders", "heel-mr"):
+            (label, colour), results = ENGINES[engine], Results(RESULTS / "accuracy" / engine)
             values = [results.error(tissue, condition=condition) for condition in CONDITIONS]
             one.plot(range(3), values[:3], MARKERS[colour], color=colour, label=label)
             one.plot((3, 4), values[3:], MARKERS[colour][0], color=colour)
@@ -104,7 +105,7 @@ def error() -> Figure:
 
 
 def engines() -> Figure:
-    """Error of each engine under every motion: in fat, in fat beside bone, and in skin; labels are correct."""
+    """Error of each engine under every motion: in fat, in fat beside bone, and in skin; masks are correct."""
     figure, axes = panels(3)
     motions = ("smooth", "sliding", "Load1", "Load3")
     shown: dict[str, tuple[str, float | None]] = {
@@ -112,12 +113,13 @@ def engines() -> Figure:
     }  # fmt: skip
     for one, (title, (tissue, to_bone_mm)) in zip(axes, shown.items(), strict=True):
         for place, (engine, (label, colour)) in enumerate(ENGINES.items()):
-            folder, off = (LABEL_MAPS, 0) if engine.endswith("borders") else (engine, None)
+            folder = {"gauss-newton-borders": LABEL_MAPS, "gauss-newton-bone": BONE_MASKS}.get(engine, engine)
+            off = None if folder == engine else 0
             results = Results(RESULTS / "accuracy" / folder)
             heights = [
                 results.error(tissue, motions=(motion,), to_bone_mm=to_bone_mm, labels_off=off) for motion in motions
             ]
-            one.bar(np.arange(len(motions)) + 0.27 * (place - 1), heights, 0.25, color=colour, label=label)
+            one.bar(np.arange(len(motions)) + 0.21 * (place - 1.5), heights, 0.2, color=colour, label=label)
         one.set(title=title, ylim=(0, 0.1))
         one.set_xticks(range(len(motions)), motions, fontsize=8)
     axes[0].set_ylabel("RMSE of the max. shear")
@@ -145,18 +147,18 @@ def resolution() -> Figure:
 
 
 def coverage() -> Figure:
-    """Voxels that the error bars cover, by tissue and motion, with and without a label map."""
+    """Voxels that the error bars cover, by tissue, motion and engine."""
     told = read("unforeseen")
     columns = {"fat": "fat", "muscle": "muscle", "skin": "skin", "near bone": "within 3 mm of bone"}
-    engines = (("gauss-newton-borders", "with a label map", 0.14), ("gauss-newton", "without", -0.14))
+    engines = (("gauss-newton-borders", 0.2), ("gauss-newton-bone", 0.0), ("gauss-newton", -0.2))
     figure, axes = panels(len(columns), 3.6)
     rows = list(reversed(MOTIONS))
     seen = [place for place, motion in enumerate(rows) if motion in SEEN]
     for one, (column, title) in zip(axes, columns.items(), strict=True):
         one.axhspan(min(seen) - 0.5, max(seen) + 0.5, color=OTHERS, alpha=0.15, linewidth=0)
         one.axvline(95, color="k", linewidth=0.6, linestyle=":")
-        for engine, label, up in engines:
-            colour = ENGINES[engine][1]
+        for engine, up in engines:
+            label, colour = ENGINES[engine]
             shares = [100.0 * told[engine][motion][column] for motion in rows]
             one.plot(shares, np.arange(len(rows)) + up, MARKERS[colour][0], color=colour, label=label, markersize=5)
         one.grid(visible=False)

@@ -56,10 +56,11 @@ _CLOSING = Section(
         "and that of each sample is computed. An interval may exclude the area as measured, because noise and "
         "smoothing shift the measured curve. Two models differ significantly if one has the smaller area in at least "
         "97.5 % of the samples, whose spread is widened like the intervals.",
-        "A measurement without a label map smooths strain discontinuities at tissue interfaces over 3 to 5 mm, and "
-        "noise increases small shear strains; a model does neither. A comparison cannot show effects that the "
-        "measurement cannot detect: scanner distortion, creep during a scan, and sliding along smooth skin or within a "
-        "uniform region. Strain thresholds are not injury thresholds, unless their source below gives a reason.",
+        "A measurement without a label map smooths strain discontinuities between soft tissues over 3 to 5 mm (one "
+        "smooth spline also those at the bone), and noise increases small shear strains; a model does neither. A "
+        "comparison cannot show effects that the measurement cannot detect: scanner distortion, creep during a scan, "
+        "and sliding along smooth skin or within a uniform region. Strain thresholds are not injury thresholds, unless "
+        "their source below gives a reason.",
     ),
 )  # fmt: skip
 

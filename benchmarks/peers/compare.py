@@ -42,7 +42,7 @@ OURS = [sys.executable, "-m"]
 PEERS: dict[str, tuple[list[str], list[str]]] = {  # command, and what follows FOLDER THREADS
     **{
         name: ([*OURS, "benchmarks.peers.with_mrstrain"], [name])
-        for name in ("gauss-newton", "gauss-newton-borders", "heel-mr")
+        for name in ("gauss-newton", "gauss-newton-bone", "gauss-newton-borders", "heel-mr")
     },
     "elastix default, as acquired": ([*OURS, "benchmarks.peers.with_elastix"], ["as-acquired"]),
     "elastix default": ([*OURS, "benchmarks.peers.with_elastix"], []),

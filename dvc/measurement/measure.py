@@ -12,7 +12,7 @@ from dvc.io.meshes.read import MeshFile
 from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
 from dvc.measurement.subject import Subject, plate_directions
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.engines import gauss_newton
 from dvc.registration.register import Settings, register
 from dvc.trust.error_model import ErrorModel, error_model_of
 from dvc.worker import Worker
@@ -55,8 +55,8 @@ def measure(
     start : Deformation, optional
         First guess of the displacement of tissue relative to its bone, such as that of another load.
     settings : Settings, optional
-        Default: the Gauss-Newton engine, with strain discontinuities at tissue interfaces if labels are given; one
-        thread.
+        Default: the Gauss-Newton engine, with strain discontinuities at tissue interfaces if labels are given, else at
+        the surface of the bone; one thread.
     repeat : Image, optional
         A second unloaded image: its apparent strain is the noise floor.
     landmarks : ((n, 3), (n, 3)), optional
@@ -91,7 +91,7 @@ def measure(
     normal, axes = plate_directions(plate_normal, shear_direction)
     pressed = plate_normal is not None or axes is not None
     subject = Subject(reference, bone, tissue, labels, mesh, normal, axes, pressed=pressed)
-    chosen = settings or Settings(GaussNewton() if labels is None else GaussNewtonWithInterfaces())
+    chosen = settings or Settings(gauss_newton(labelled=labels is not None, on_bone=True))
     body, floor = subject.body(), None
     with nullcontext(worker) if worker is not None else Worker(chosen.threads) as runner:
         given = {"bone": bone, "tissue": body, "labels": labels, "worker": runner, "progress": progress}

@@ -9,11 +9,23 @@ from dvc.registration.elastix.presets import load_preset, preset_names, read_par
 from dvc.registration.engine import Engine
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 
+_SMOOTH = GaussNewton()
 DEFAULT = GaussNewton.name
 """Name of the engine that is used unless another is asked for."""
 _OURS = GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in _OURS}
 """Engines that are known by one name. elastix is known by its presets and parameter files."""
+
+
+def gauss_newton(smooth: GaussNewton = _SMOOTH, *, labelled: bool, on_bone: bool) -> Engine:
+    """The Gauss-Newton engine with every strain discontinuity that the input allows.
+
+    At the tissue interfaces of a label map (``labelled``), else at the surface of the bone that images are aligned on
+    (``on_bone``), else nowhere.
+    """
+    if labelled:
+        return GaussNewtonWithInterfaces(smooth)
+    return GaussNewtonAtBone(smooth) if on_bone else smooth
 
 
 def families() -> list[str]:

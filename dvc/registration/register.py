@@ -30,7 +30,7 @@ from dvc.memory import hand_memory_back
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.registration.bone_mask import mask_doubt
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
-from dvc.registration.engines import DEFAULT, engine_named
+from dvc.registration.engines import engine_named, gauss_newton
 from dvc.threads import most_threads, usable_cores
 from dvc.worker import Worker
 
@@ -64,7 +64,7 @@ class Settings:
         For an engine by its name (see `Settings.of`), another alignment, less than one thread, or far too many.
     """
 
-    engine: Engine = field(default_factory=lambda: engine_named(DEFAULT))
+    engine: Engine
     align_on: AlignOn = "bone"
     seed: int = 1
     threads: int = 1
@@ -85,7 +85,7 @@ class Settings:
         return replace(self, engine=self.engine.of_repeat())
 
     @classmethod
-    def of(cls, name: str = DEFAULT, **others: Any) -> Self:
+    def of(cls, name: str, **others: Any) -> Self:
         """Settings with an engine by its name, as in `dvc.registration.engines.engine_named`."""
         return cls(engine_named(name), **others)
 
@@ -156,7 +156,7 @@ def register(
     ----------
     reference, loaded, bone, tissue, labels, settings, worker, progress
         As in `dvc.measure`. Only an engine with strain discontinuities at tissue interfaces uses labels, and needs
-        them. Default settings: gauss-newton without interfaces, on one thread.
+        them.
     start : Deformation, optional
         First guess, such as the ``displacement`` of another load. It is then fitted to these two images, so its errors
         do not accumulate. elastix can start only from a `BSpline`.
@@ -178,7 +178,7 @@ def register(
         If the process dies.
     """
     began = time.monotonic()
-    chosen = settings or Settings()
+    chosen = settings or Settings(gauss_newton(labelled=labels is not None, on_bone=True))
     engine, tell = chosen.engine, progress or (lambda _stage, _fraction: None)
     refuse_one_image_twice([("The unloaded image", reference), ("the loaded one", loaded)])
     body = tissue if tissue is not None else tissue_mask(reference)

@@ -141,9 +141,9 @@ def accuracy(
     preset: Annotated[
         list[str] | None,
         typer.Option(
-            help="Engine or elastix preset to test: gauss-newton, gauss-newton-bone (discontinuous at the bone, no "
-            "labels), gauss-newton-borders (with labels), heel-mr, or an elastix parameter file (.txt). Default: "
-            "gauss-newton. Repeat for several."
+            help="Engine or elastix preset to test: gauss-newton (one smooth spline), gauss-newton-bone "
+            "(discontinuous at the bone, as without labels), gauss-newton-borders (as with labels), heel-mr, or an "
+            "elastix parameter file (.txt). Default: gauss-newton. Repeat for several."
         ),
     ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Voxel edge, mm. Repeat for several.")] = None,

@@ -76,8 +76,7 @@ def fill_subject(given: _F, record: MeasuredWith) -> _F:
 def fill_engine(given: _E, record: MeasuredWith, *, labelled: bool) -> _E:
     """The engine of a registration: as given, or that of the measurement; errors as `MeasuredWith.find`.
 
-    Whether it is ``labelled`` now decides what its engine is by default. InputError where labels are given now that the
-    measurement did without.
+    InputError where it is ``labelled`` now and the measurement did without labels.
     """
     if given.engine or given.preset or given.parameters:
         return given
@@ -87,13 +86,14 @@ def fill_engine(given: _E, record: MeasuredWith, *, labelled: bool) -> _E:
         return given.model_copy(update=_elastix(record))
     if family == GAUSS_NEWTON and given.borders is None:
         borders = how.get("borders")
-        if labelled and "bone_alone" in (borders or {}):
+        at_bone = "bone_alone" in (borders or {})
+        if labelled and at_bone:
             raise InputError(
                 f"{record.path}: in this measurement, strain could be discontinuous only at the surface of the bone. "
                 "Leave out the label map (labels), so that the model is measured in the same way."
             )
-        if labelled != (borders is not None):  # not what it is by default
-            return given.model_copy(update={"borders": borders is not None})
+        if borders is None or at_bone:  # the latter is then refused, not left out, without an alignment on the bone
+            return given.model_copy(update={"borders": at_bone})
     return given.model_copy(update={"engine": family}) if family not in (None, DEFAULT) else given
 
 

@@ -64,8 +64,9 @@ _HOW_TO_READ = (
     "det F is the ratio of deformed to reference volume.",
     "The verdict concerns the registration, not the tissue. Sliding inside a uniform region or along a smooth skin "
     "leaves no trace in an image and cannot be detected. Noise raises small shear strains; a repeat scan without load "
-    "(--repeat) shows by how much. Without a label map, a strain discontinuity at a tissue interface is smoothed over "
-    "about one control point spacing (3 to 5 mm). Scanner distortion and creep between scans are not detected.",
+    "(--repeat) shows by how much. Without a label map, a strain discontinuity between soft tissues is smoothed over "
+    "about one control point spacing (3 to 5 mm); with one smooth spline, so is that at the bone. Scanner distortion "
+    "and creep between scans are not detected.",
     "The noise floor is the apparent strain between two unloaded images. MAER is the mean over voxels of the mean "
     "absolute value of the six strain components, SDER the standard deviation of the same.",
     "Missing values are NaN in every map, never zero; valid.nii.gz marks the voxels with values. Programs built on ITK "

@@ -10,13 +10,13 @@ from dvc import (
     read_parameter_file,
 )
 from dvc.errors import InputError, ParameterError
-from dvc.registration.engines import DEFAULT, ENGINES
+from dvc.registration.engines import DEFAULT, ENGINES, gauss_newton
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 
 GAUSS_NEWTON, ELASTIX = GaussNewton.family, Elastix.family
-WITH_LABELS = GaussNewtonWithInterfaces().name
-"""The engine of a registration with a label map."""
+AT_BONE, WITH_LABELS = GaussNewtonAtBone().name, GaussNewtonWithInterfaces().name
+"""The engines of a registration with a mask of the bone alone, and with a label map."""
 
 
 def _asked(how: EngineOptions) -> str:
@@ -32,8 +32,8 @@ def volume_kept(how: EngineOptions) -> float | None:
 def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
     """The engine asked for, with its preset, parameter files or weights; options of another engine are refused.
 
-    With a label map (``labelled``) the Gauss-Newton engine allows strain discontinuities at tissue interfaces, unless
-    ``borders`` is False. Without one it allows them at the surface of the bone if ``borders`` is True.
+    The Gauss-Newton engine allows strain discontinuities at tissue interfaces with a label map (``labelled``), and at
+    the surface of the bone without one, if images are aligned on it; nowhere if ``borders`` is False.
     """
     name, preset, parameters = _asked(how), how.preset, how.parameters
     bending, volume, borders = how.bending, how.volume, how.borders
@@ -44,14 +44,14 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
         )
     if name == GAUSS_NEWTON:
         smooth = GaussNewton(bending=bending, volume=volume)
-        if labelled and borders is not False:
-            return GaussNewtonWithInterfaces(smooth)
-        if borders and how.align != "bone":
+        if borders is False:
+            return smooth
+        if borders and not labelled and how.align != "bone":
             raise InputError(
                 "`borders` needs a label map: labels (--labels), or images aligned on the bone: align bone (--align "
                 "bone). Otherwise leave it out."
             )
-        return GaussNewtonAtBone(smooth) if borders else smooth
+        return gauss_newton(smooth, labelled=labelled, on_bone=how.align == "bone")
     if bending is not None or volume is not None:
         raise ParameterError(f"bending and volume are only for the engine {GAUSS_NEWTON}; the engine is {name}.")
     if borders:

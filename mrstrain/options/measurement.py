@@ -195,9 +195,9 @@ class EngineOptions(Options):
     engine: Annotated[str, AfterValidator(_known_engine)] | None = None
     """Registration engine: gauss-newton or elastix. Default: gauss-newton; with --preset or --parameters, elastix."""
     borders: Flag | None = None
-    """gauss-newton: allow strain discontinuities at tissue interfaces. Default: on with --labels; disable it if label
-    boundaries are wrong by more than one voxel. Without --labels (default: off): only at the surface of the bone, as
-    the image shows it near that of the mask, without error bars."""
+    """gauss-newton: allow strain discontinuities at the tissue interfaces of --labels, or without labels at the surface
+    of the bone, as the image shows it near that of the mask. Default: on; disable it if label boundaries are wrong by
+    more than one voxel."""
     preset: str | None = None
     """Built-in elastix parameters: heel-mr."""
     parameters: tuple[Path, ...] = ()

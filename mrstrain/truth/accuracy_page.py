@@ -142,7 +142,7 @@ def _sentence(condition: _Condition, errors: Sequence[ErrorRow], floors: Sequenc
     over = f" over {len(motions)} motions, with their range" if len(motions) > 1 else ""
     told = [f"the max. shear has an error (RMSE{over}) of {_listed(error)}"] if error else []
     told += [f"the noise floor (median) is {_listed(floor)}"] if floor else []
-    labels = " without a label map" if preset == GAUSS_NEWTON else ""
+    labels = " (one smooth spline)" if preset == GAUSS_NEWTON else ""
     return f"With {preset}{labels}, voxels of {voxel} mm and SNR {snr:g}, {'; '.join(told)}."
 
 

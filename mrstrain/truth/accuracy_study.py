@@ -10,7 +10,7 @@ from dvc import engine_named
 from dvc.atomic_files import whole_folder, write_csv, write_json
 from dvc.io.result_folder import FIGURES, PROVENANCE, REPORT
 from dvc.report.page import record_lines, write_report
-from mrstrain.measurement.engines import GAUSS_NEWTON, WITH_LABELS
+from mrstrain.measurement.engines import AT_BONE, GAUSS_NEWTON, WITH_LABELS
 from mrstrain.records.provenance import provenance
 from mrstrain.truth.accuracy_page import HOW_TO_READ, answers, motion_of, sections_of
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow
@@ -75,7 +75,7 @@ class AccuracyStudy:
         with whole_folder(out / FIGURES) as folder:
             sections = sections_of(errors, floors, resolution, coverage, failures, folder)
         notes = [f"Incomplete: {len(failures)} of {len(runs) + len(failures)} cases failed."] if failures else []
-        notes += [*few, *study.without_labels]
+        notes += [*few, *study.one_spline]
         title, lines = "Accuracy of registration engines", record_lines(record)
         write_report(out / REPORT, title, None, sections, [HOW_TO_READ], lines, notes=notes)
         return study
@@ -86,19 +86,19 @@ class AccuracyStudy:
         return not self.failures
 
     @property
-    def without_labels(self) -> list[str]:
-        """A sentence if the engine that `register` uses with a label map was measured without one alone."""
+    def one_spline(self) -> list[str]:
+        """A sentence if the Gauss-Newton engine was measured, but not as `register` uses it by default."""
         measured = {row.preset for row in (*self.errors, *self.resolution)}
-        if GAUSS_NEWTON not in measured or WITH_LABELS in measured:
+        if GAUSS_NEWTON not in measured or measured & {AT_BONE, WITH_LABELS}:
             return []
         return [
-            f"{GAUSS_NEWTON} was measured without a label map. `register --labels` uses {WITH_LABELS}; measure its "
-            f"error with `--preset {WITH_LABELS}`."
+            f"{GAUSS_NEWTON} fits one smooth spline, as `register --no-borders` does. By default, `register` uses "
+            f"{AT_BONE}, or {WITH_LABELS} with a label map; measure their error with `--preset`."
         ]
 
     def summary(self) -> list[str]:
         """Summary, a few lines: the answer of the report first."""
-        lines = answers(self.errors, self.floors) + self.without_labels
+        lines = answers(self.errors, self.floors) + self.one_spline
         lines += [
             f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {motion_of(r)}, {r.tissue}: max. shear RMSE "
             f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"

@@ -104,7 +104,7 @@ def test_text_with_a_null_character_is_no_path(hint: Any) -> None:
 def test_others_refuse_as_well() -> None:
     plate, load = fe.Plate((0, 0, -1), (0, -1, 0)), fe.LoadStep("a", normal_n=2.0)
     for call, told in (
-        (lambda: dvc.Settings(threads="2"), "threads must be a whole number; got '2'"),
+        (lambda: dvc.Settings.of("gauss-newton", threads="2"), "threads must be a whole number; got '2'"),
         (lambda: dvc.GaussNewton(bending="3"), "bending must be a number; got '3'"),
         (lambda: dvc.Image(IMAGE.values, GRID), "grid must be a dvc.Grid"),
         (lambda: dvc.Image(GRID, "a.nii"), "An array of numbers is needed; got 'a.nii'"),

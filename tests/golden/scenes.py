@@ -38,11 +38,12 @@ def phantom(folder: Path, threads: int) -> Path:
 
 
 def smooth(folder: Path, threads: int) -> Path:
-    """Gauss-Newton without labels: the plate's axes, the mesh."""
+    """Gauss-Newton with one smooth spline: the plate's axes, the mesh."""
     labels = nibabel.load(GIVEN / "tissues.nii.gz")
     bone = (np.asarray(labels.dataobj) == 1).astype(np.uint8)
     nibabel.save(nibabel.Nifti1Image(bone, labels.affine, labels.header), folder / "bone.nii.gz")
-    return _registered(folder, threads, bone=folder / "bone.nii.gz", shear_direction=(0.0, -1.0, 0.0), **_MESH)
+    plate = {"shear_direction": (0.0, -1.0, 0.0)}
+    return _registered(folder, threads, bone=folder / "bone.nii.gz", borders=False, **plate, **_MESH)
 
 
 def interfaces(folder: Path, threads: int) -> Path:

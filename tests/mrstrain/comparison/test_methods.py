@@ -284,7 +284,7 @@ def test_formats_are_those_of_the_record_that_register_makes(tmp_path: Path) -> 
     dvc.write_mask(bone, dvc.Mask(grid, half))
     dvc.write_labels(labels, dvc.LabelMap(grid, half.astype(int), {1: "fat"}))
     subject = read_subject(load0, SubjectFiles(bone=bone, labels=labels, names=tmp_path / "labels.csv"))
-    record = record_of(subject, {"loads": [load0]}, Settings.of(), RegistrationOptions(), {})
+    record = record_of(subject, {"loads": [load0]}, Settings.of("gauss-newton"), RegistrationOptions(), {})
     (tmp_path / "provenance.json").write_text(json.dumps(record))
     assert "Images (MetaImage, NIfTI, NRRD) were read" in told({"Load1": tmp_path}, {})
 

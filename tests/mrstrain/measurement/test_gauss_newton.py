@@ -17,7 +17,7 @@ from dvc.io.result_folder import spline_in
 from dvc.measurement.page import weights_table
 from dvc.registration.elastix.presets import load_preset
 from dvc.registration.gauss_newton.choice import Choice
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 from dvc.registration.gauss_newton.fit import USUAL_BENDING, USUAL_VOLUME
 from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings
@@ -128,7 +128,7 @@ def test_an_offset_of_brightness_is_not_trusted(written, tiny_pair, tmp_path):
 
 def test_error_bars_are_the_engines_own(written):
     assert (written / "out" / "Load1" / "sigma_max_shear.nii.gz").exists()
-    assert json.loads((written / "out" / "Load1" / "error_model.json").read_text())["preset"] == "gauss-newton"
+    assert json.loads((written / "out" / "Load1" / "error_model.json").read_text())["preset"] == "gauss-newton-bone"
 
 
 @pytest.mark.parametrize(
@@ -169,14 +169,14 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
             written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "o", bone=written / "bone.nii.gz",
             repeat=tmp_path / "again.nii.gz", workers=1, threads=1,
         )  # fmt: skip
-    assert used == {1.0: GaussNewton(), 2.0: GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)}
+    fixed = GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)
+    assert used == {1.0: GaussNewtonAtBone(), 2.0: GaussNewtonAtBone(fixed)}
     used.clear()
     with pytest.raises(RegistrationError):
         register_one(
             written / "Load0.nii.gz", tmp_path / "again.nii.gz", out=tmp_path / "repeat",
             labels=tmp_path / "labels.nii.gz", names=None, bone=written / "bone.nii.gz",
         )  # fmt: skip
-    fixed = GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)
     assert used == {2.0: GaussNewtonWithInterfaces(fixed, USUAL_SKIN)}
     assert Settings.of("heel-mr").of_repeat() == Settings.of("heel-mr")
 
@@ -197,15 +197,16 @@ def test_a_load_of_a_chain_starts_from_the_result_before_it(written, tmp_path, m
                 bone=written / "bone.nii.gz", after=after,
             )  # fmt: skip
     started, anew = begun_at
-    np.testing.assert_array_equal(started.coefficients_mm, spline_in(before).coefficients_mm)
+    np.testing.assert_array_equal(started.jump.coefficients_mm, spline_in(before).jump.coefficients_mm)
     assert anew is None
 
 
 def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
     (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
     asked = RegistrationOptions
-    assert engine_of(asked()) == GaussNewton()
-    assert engine_of(asked(bending=2.0)) == GaussNewton(bending=2.0)
+    assert engine_of(asked()) == GaussNewtonAtBone()
+    assert engine_of(asked(bending=2.0)) == GaussNewtonAtBone(GaussNewton(bending=2.0))
+    assert engine_of(asked(borders=False)) == engine_of(asked(align="image")) == GaussNewton()
     assert engine_of(asked(), labelled=True) == GaussNewtonWithInterfaces()
     assert engine_of(asked(borders=False), labelled=True) == GaussNewton()
     assert engine_of(asked(engine="elastix"), labelled=True) == engine_of(asked(engine="elastix"))

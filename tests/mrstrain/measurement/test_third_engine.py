@@ -112,8 +112,7 @@ def test_its_results_are_written_read_and_told(tmp_path: Path, monkeypatch) -> N
 
 ENGINES_KNOWN_IN = {
     "dvc/labelling/carried.py",  # between two subjects it has weights of its own
-    "dvc/measurement/measure.py",  # the default, with labels and without
-    "dvc/registration/engines.py",
+    "dvc/registration/engines.py",  # every engine by its name, and the default
     "mrstrain/measurement/engines.py",  # options of the command line to an engine
 }
 CLASSES = {"GaussNewton", "GaussNewtonAtBone", "GaussNewtonWithInterfaces", "Elastix"}

@@ -337,8 +337,8 @@ def test_far_too_many_threads_are_refused_and_workers_limited_with_the_number_of
     told = CliRunner().invoke(app, ["simulate", "m.vtu", "--load", "a=1", "--threads", "100000", "--out", "out"])
     assert str(told.exception) == "--threads: must be 256 or less (cores of this machine: 2); got 100000."
     with pytest.raises(ParameterError, match=r"must be 1 to 256; got 100000\. This machine has 2 cores\."):
-        Settings(threads=100000)
-    assert Threads(threads=256).threads == Settings(threads=256).threads == 256
+        Settings.of("gauss-newton", threads=100000)
+    assert Threads(threads=256).threads == Settings.of("gauss-newton", threads=256).threads == 256
     caplog.clear()
     assert (in_parallel(None), in_parallel(1), in_parallel(2)) == (2, 1, 2)
     assert caplog.messages == []

@@ -64,7 +64,7 @@ def test_the_page_begins_with_the_answer_at_the_usual_condition(tmp_path: Path, 
     """The error is over both motions, sqrt((.03^2 + .04^2) / 2), and the unloaded pair is the noise floor alone."""
     first, *others = sections(runs, tmp_path, {"a case": "a reason"})
     assert first.paragraphs == (
-        "With gauss-newton without a label map, voxels of 0.8 mm and SNR 25, the max. shear has an error (RMSE over 2 "
+        "With gauss-newton (one smooth spline), voxels of 0.8 mm and SNR 25, the max. shear has an error (RMSE over 2 "
         "motions, with their range) of 0.035 (0.030 to 0.040) in fat, 0.035 (0.030 to 0.040) in muscle and 0.035 "
         "(0.030 to 0.040) in skin; the noise floor (median) is 0.010 in fat, 0.010 in muscle and 0.010 in skin.",
     )
@@ -95,7 +95,7 @@ def test_a_study_without_strain_or_without_a_noise_floor_says_what_it_knows(tmp_
     error = "the max. shear has an error (RMSE) of 0.030 in fat, 0.030 in muscle and 0.030 in skin."
     for run, says in ((still, floor), (loaded, error)):
         (sentence,) = sections([run], tmp_path)[0].paragraphs
-        assert sentence == f"With gauss-newton without a label map, voxels of 0.8 mm and SNR 25, {says}"
+        assert sentence == f"With gauss-newton (one smooth spline), voxels of 0.8 mm and SNR 25, {says}"
     assert sections([still], tmp_path)[0].pictures == ()  # rather than an empty one
 
 
@@ -131,15 +131,15 @@ def test_the_terminal_begins_with_the_answer_of_the_page(tmp_path: Path, runs: l
         "With heel-mr, voxels of 0.8 mm and SNR 25, the max. shear has an error (RMSE) of 0.100 in"
     )
     assert labels == (
-        "gauss-newton was measured without a label map. `register --labels` uses gauss-newton-borders; measure its "
-        "error with `--preset gauss-newton-borders`."
+        "gauss-newton fits one smooth spline, as `register --no-borders` does. By default, `register` uses "
+        "gauss-newton-bone, or gauss-newton-borders with a label map; measure their error with `--preset`."
     )
     assert first.startswith("heel-mr, 0.8 mm, SNR 25, smooth, fat: max. shear RMSE")
     page = (tmp_path / "report.html").read_text()
-    assert page.index("measure its error with") < page.index("<img")
+    assert page.index("measure their error with") < page.index("<img")
     with_labels = in_three_tissues(replace(USUAL, preset="gauss-newton-borders"), 0.02)
     for measured in ([*runs, with_labels], runs[:1]):  # it was measured, or only another preset was
-        assert not AccuracyStudy.of(tmp_path, measured, {}).without_labels
+        assert not AccuracyStudy.of(tmp_path, measured, {}).one_spline
 
 
 def test_the_sentence_precedes_the_picture_and_the_picture_every_table(
