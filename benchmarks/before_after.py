@@ -38,10 +38,13 @@ HERE = Path(__file__).resolve().parents[1]
 def run(
     tree: Path, folder: Path, labels: bool, out: Path, variables: Mapping[str, str] | None = None
 ) -> dict[str, float]:
-    """One run of the command with a tree's code, and variables of the environment beside those here."""
+    """One run of the command with a tree's code, and variables of the environment beside those here.
+
+    Without labels one smooth spline is fitted, in any tree.
+    """
     command = [sys.executable, "-m", "mrstrain", "register", "Load0.nii.gz", "Load1.nii.gz"]
     command += ["--bone", "bone.nii.gz", "--out", str(out)]
-    command += ["--labels", "tissues.nii.gz", "--names", "tissues.csv"] if labels else []
+    command += ["--labels", "tissues.nii.gz", "--names", "tissues.csv"] if labels else ["--no-borders"]
     environment = os.environ | {"PYTHONPATH": str(tree)} | dict(variables or {})
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed copy holds the bytecode of its modules
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()

@@ -1,7 +1,7 @@
 """Error with label maps, or bone masks, that are right, too large and too small, each of them under every motion.
 
     python -m benchmarks.label_maps --work DIR --out benchmarks/results/accuracy/label-maps
-    python -m benchmarks.label_maps --work DIR2 --engine gauss-newton-bone --out benchmarks/results/accuracy/bone-masks
+    python -m benchmarks.label_maps --work DIR2 --engine gauss-newton-bone --off 0 --out .../accuracy/bone-masks
 
 The accuracy study combines each motion with one of the three, in turn. Here all are combined, on the heels that nothing
 is tuned on (0.8 mm, SNR 25): 42 registrations, 20 minutes on two cores.
@@ -27,11 +27,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0])
+    parser.add_argument("--off", type=int, nargs="+", choices=LABELS_OFF, default=LABELS_OFF, help="voxels too large")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     cases = [
         AccuracyCase(given.engine, (0.8, 0.8, 0.8), 25.0, motion, seed, off)
-        for off in LABELS_OFF
+        for off in given.off
         for motion in MOTIONS
         for seed in SEEDS
     ]

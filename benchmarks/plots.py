@@ -190,13 +190,17 @@ def areas() -> Figure:
 def registration() -> Figure:
     """Processor time and memory of `mrstrain register` over the number of voxels."""
     figure, axes = panels(2)
-    kinds = {(False, None): ENGINES["gauss-newton"], (True, None): ENGINES["gauss-newton-borders"],
-             (False, "heel-mr"): ENGINES["heel-mr"]}  # fmt: skip
+    kinds = {
+        (False, None, False): ENGINES["gauss-newton-bone"], (True, None, False): ENGINES["gauss-newton-borders"],
+        (False, None, True): ENGINES["gauss-newton"], (False, "heel-mr", False): ENGINES["heel-mr"],
+    }  # fmt: skip
     runs = read("register_scaling")["runs"]
     for one, key, label in zip(axes, ("processor_s", "peak_gib"), ("processor time, s", "memory, GiB"), strict=True):
-        for (labels, preset), (name, colour) in kinds.items():
+        for kind, (name, colour) in kinds.items():
             chosen = sorted(
-                (run["voxels"] / 1e6, run[key]) for run in runs if (run["labels"], run["preset"]) == (labels, preset)
+                (run["voxels"] / 1e6, run[key])
+                for run in runs
+                if (run["labels"], run["preset"], run["one_spline"]) == kind
             )
             one.plot(*zip(*chosen, strict=True), MARKERS[colour], color=colour, label=name)
         one.set(xlabel="million voxels", ylabel=label, xlim=(0, None), ylim=(0, None))

@@ -45,7 +45,7 @@ def written(pair: HeelPair, count: int, folder: Path) -> None:
     write_labels(folder / "tissues.nii.gz", fit_mask(pair.labels, divided(pair.reference.grid, count), "label map"))
 
 
-def registered(pair: HeelPair, count: int, labels: bool, preset: str | None) -> dict[str, object]:
+def registered(pair: HeelPair, count: int, labels: bool, preset: str | None, one_spline: bool) -> dict[str, object]:
     """One run of the command."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
@@ -63,6 +63,7 @@ def registered(pair: HeelPair, count: int, labels: bool, preset: str | None) -> 
             ["--labels", str(folder / "tissues.nii.gz"), "--names", str(folder / "tissues.csv")] if labels else []
         )
         command += [] if preset is None else ["--preset", preset]
+        command += ["--no-borders"] if one_spline else []
         before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         peak = peak_kib(process)
@@ -71,6 +72,7 @@ def registered(pair: HeelPair, count: int, labels: bool, preset: str | None) -> 
             "voxels": count**3,
             "labels": labels,
             "preset": preset,
+            "one_spline": one_spline,
             "exit_status": process.returncode,
             "processor_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
             "wall_s": round(time.perf_counter() - began, 1),
@@ -83,12 +85,13 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[128, 192, 256])
     parser.add_argument("--labels", action="store_true")
     parser.add_argument("--preset")
+    parser.add_argument("--one-spline", action="store_true", help="without strain discontinuities")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     pair = heel_pair(seed=1, load=0.6)
     for count in given.sizes:
         runs = json.loads(given.out.read_text())["runs"] if given.out.is_file() else []
-        runs.append(registered(pair, count, given.labels, given.preset))
+        runs.append(registered(pair, count, given.labels, given.preset, given.one_spline))
         print(runs[-1], flush=True)
         given.out.write_text(json.dumps({"versions": versions(), "runs": runs}, indent=1) + "\n")
 

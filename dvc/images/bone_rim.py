@@ -41,8 +41,11 @@ def reach_of(spacing_mm: FloatArray) -> float:
     return _REACH * float(spacing_mm.mean())
 
 
-def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
+def bone_to_rim(image: Image, bone: Mask, body: Mask) -> tuple[Mask, float]:
     """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
+
+    Also the share of this surface from which the distance is known: .3 to .95 on phantom heels, 0 without a rim, in a
+    cortex thicker than the surface can move, and if the mask is two voxels too small.
 
     The distance is averaged on the surface in a neighbourhood of 6 mm (standard deviation; less in a thin bone), which
     corrects a mask that is too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects
@@ -54,7 +57,7 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     """
     spacing = image.grid.spacing_mm
     if spacing.max() > _THICKEST * spacing.min():
-        return bone
+        return bone, 0.0
     reach_mm, edge_mm = reach_of(spacing), float(spacing.mean())
     box = bone.box(int(np.ceil((reach_mm + _TRUNCATE * _AROUND_MM) / spacing.min())))
     part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
@@ -63,15 +66,16 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask) -> Mask:
     if rims.goes_on.any():
         clear_mm = distance_transform_edt(~rims.goes_on, sampling=spacing)
     depth, depth_of_rim = (depth_mm(of, spacing) for of in (given, np.where(rims.seen, rims.found, given)))
-    mean_mm = min(_MEAN_MM, _OF_DEEPEST * float(depth.max()))
+    mean_mm, shown = min(_MEAN_MM, _OF_DEEPEST * float(depth.max())), list[float]()
     for around_mm, least, clear in ((mean_mm, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
         surface = rims.near & (np.abs(depth) < 0.55 * edge_mm)  # beside a plane: 0.52
         known = surface & rims.seen & (clear_mm > clear * reach_mm)
+        shown.append(float(known[surface].mean()) if surface.any() else 0.0)
         off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
         depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)
     found = bone.inside.copy()
     found[box] = np.where(rims.near & ~rims.core, depth > 0.0, given)
-    return Mask(bone.grid, found)
+    return Mask(bone.grid, found), shown[0]
 
 
 def bones_to_rims(

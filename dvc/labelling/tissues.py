@@ -125,7 +125,7 @@ def label_tissues(
     doubt = ""
     if known.any() and not bone_is_exact:
         doubt = mask_doubt(image, Mask(grid, known), Mask(grid, whole))
-        known = bone_to_rim(even, Mask(grid, known), Mask(grid, whole)).inside
+        known = bone_to_rim(even, Mask(grid, known), Mask(grid, whole))[0].inside
         soft = whole & ~known
     watch(0.15)
     skin = Skin.of(even, Mask(grid, whole), known | image.missing)

@@ -18,7 +18,7 @@ from dvc.images.image import Grid, Mask
 from dvc.measurement.subject import Subject
 from dvc.registration.register import Registration
 from dvc.trust.components import ComponentUncertainty, components_of
-from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
+from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, error_model_of
 from dvc.trust.field_draws import FieldDraws, TrueField
 from dvc.trust.gaps import without_gaps
 from dvc.trust.twin_judgement import Judged, judged
@@ -154,7 +154,7 @@ def error_bars(
     the pair's twin are made wider.
     """
     grid = maps.grid
-    larger = _larger_voxel(found)
+    larger, model = _larger_voxel(found), model or error_model_of(found.settings.engine.name)
     bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
     try:
         chosen = _model_for(found, model)

@@ -47,7 +47,7 @@ class Evidence:
     noise_floor : NoiseFloor, optional
         Of a repeat scan.
     error_model : ErrorModel, optional
-        Of the engine or preset that is used; without one there are no error bars.
+        Of the engine or preset that is used; by default the built-in one, if there is one.
     twin : TwinCheck, optional
         Result of registering a synthetic warp of the unloaded image by the measured displacement.
     """

@@ -14,7 +14,7 @@ from dvc.measurement.measurement import Measurement
 from dvc.measurement.subject import Subject, plate_directions
 from dvc.registration.engines import gauss_newton
 from dvc.registration.register import Settings, register
-from dvc.trust.error_model import ErrorModel, error_model_of
+from dvc.trust.error_model import ErrorModel
 from dvc.worker import Worker
 
 
@@ -99,5 +99,5 @@ def measure(
             again = register(reference, repeat, settings=chosen.of_repeat(), **given)  # type: ignore[arg-type]
             floor = Measurement.from_registration(again, subject, is_repeat=True).quality.noise_floor
         found = register(reference, loaded, settings=chosen, start=start, **given)  # type: ignore[arg-type]
-    points, model = landmarks and landmarks[:2], error_model or error_model_of(chosen.engine.name)
-    return Measurement.from_registration(found, subject, Evidence(points, floor, model), name=name)
+    evidence = Evidence(landmarks and landmarks[:2], floor, error_model)
+    return Measurement.from_registration(found, subject, evidence, name=name)

@@ -115,6 +115,7 @@ class Found:
     displacement: Displacement
     choice: Regularisation = field(default_factory=Regularisation)
     unlike_study: str = ""  # why the engine's error model does not hold for this pair; empty where it does
+    engine: "Engine | None" = None  # that was used instead of the one asked for
 
 
 @dataclass(frozen=True, slots=True)

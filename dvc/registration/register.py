@@ -107,7 +107,7 @@ class Registration:
     displacement : Displacement
         Of tissue relative to its bone, reference configuration, LPS mm.
     settings : Settings
-        As used.
+        As used: ``settings.engine`` is the engine that was used.
     seconds : float
         Wall time.
     noise : (Noise, Noise or None)
@@ -211,8 +211,9 @@ def register(
         beside.submit(hand_memory_back)  # the worker takes its largest amount now
         found = engine.find(pair, start=guess, seeds=_seeds(chosen)[1:], worker=runner, progress=tell)
     return Registration(
-        reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,
-        time.monotonic() - began, of_noise, found.choice, found.unlike_study, doubted,
+        reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn),
+        replace(chosen, engine=found.engine or engine), time.monotonic() - began, of_noise, found.choice,
+        found.unlike_study, doubted,
     )  # fmt: skip
 
 
@@ -263,7 +264,7 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
     if settings.align_on == "bone" and bone is None:
         raise InputError(
             "Alignment on bone needs a bone mask on the unloaded image: bone (--bone on the command line). Without a "
-            "bone, use Settings(align_on='image') or 'none' (--align)."
+            "bone, use Settings(dvc.GaussNewton(), align_on='image') or 'none' (--align)."
         )
     if settings.engine.needs_labels and labels is None:
         raise InputError("Strain discontinuities at tissue interfaces need a label map: labels (--labels).")
@@ -279,6 +280,11 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
             raise InputError(f"The {name} is not on the grid of the unloaded image; resample it with fit_mask.")
         if not (given.labels if isinstance(given, LabelMap) else given.inside).any():
             raise InputError(f"The {name} is empty: all voxels are 0. Choose another file.")
+    if bone is not None and settings.align_on == "bone" and not (bone.inside & body.inside).any():
+        raise InputError(
+            "The bone lies outside the tissue mask, which has to contain it. Check that bone (--bone) and tissue "
+            "(--tissue) are of this image, or leave the tissue mask out."
+        )
     if bone is not None and (share := float(np.mean(bone.inside[body.inside]))) > _MOSTLY_BONE:
         raise InputError(
             f"The bone mask covers {100 * share:.0f} % of the body, so there is no soft tissue to measure. Check that "

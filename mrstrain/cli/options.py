@@ -49,7 +49,7 @@ EXAMPLES = {
         "register": "Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --labels auto --out results",
         "strain": "Load0.nii.gz TransformParameters.1.txt --bone calcaneus.nii.gz --out strained",
         "phantom": "--load Load1 --spacing 1.2 --out heel",
-        "twin": "Load0.nii.gz TransformParameters.1.txt --bone calcaneus.nii.gz --out twin",
+        "twin": "Load0.nii.gz results/Load1/transform.h5 --bone calcaneus.nii.gz --out twin",
         "accuracy": "--spacing 1.0 --snr 20 --motion still --motion smooth --out accuracy",
         "mesh": "tissues.nii.gz --names tissues.csv --edge-mm 2 --out heel.vtu",
         "simulate": "heel.vtu --set trebbi --load Load1=115 --out simulated",

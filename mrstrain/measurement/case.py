@@ -59,7 +59,7 @@ _HOW_TO_READ = (
     "Displacement u(X) = x - X is that of the tissue relative to its bone: the rigid motion of the bone between the "
     "scans is removed. All maps are in the reference (unloaded) configuration, on the voxels of the unloaded image; "
     "components are in LPS (x to the patient's left, y to posterior, z to superior), lengths in mm.",
-    "Strain is Green-Lagrange, E = (F^T F - I)/2 with F = I + du/dX, from the analytic gradient of the cubic B-spline. "
+    "Strain is Green-Lagrange, E = (F^T F - I)/2 with F = I + du/dX, from the analytic gradient of the spline. "
     "The maximum shear strain is (E1 - E3)/2, half the difference of the largest and smallest principal strains. "
     "det F is the ratio of deformed to reference volume.",
     "The verdict concerns the registration, not the tissue. Sliding inside a uniform region or along a smooth skin "

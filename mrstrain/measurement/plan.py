@@ -73,7 +73,13 @@ class Plan:
         measured = dvc.Measurement.from_registration(
             found, self.subject, evidence, name=folder.name, is_repeat=is_repeat
         )
-        return Case.of(measured, folder, {**self.record, **noise_record(measured)}), measured.quality.noise_floor
+        record = {**self.record, **noise_record(measured), "parameters": self._parameters(found)}
+        return Case.of(measured, folder, record), measured.quality.noise_floor
+
+    def _parameters(self, found: dvc.Registration) -> dict[str, object]:
+        """Those of the record, with the engine that was used, which may not be the one asked for."""
+        asked: Mapping[str, object] = self.record["parameters"]  # type: ignore[assignment]
+        return {**asked, **found.settings.engine.record()}
 
 
 def _load_what_draws() -> None:

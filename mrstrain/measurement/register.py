@@ -12,13 +12,12 @@ import numpy as np
 
 from dvc import Deformation, Engine, Evidence, Image, Settings, read_error_model, read_image, read_landmarks
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
-from dvc.file_names import one_spelling
+from dvc.file_names import as_typed, one_spelling
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
 from dvc.registration.align import align as align_images, without_motion
 from dvc.registration.engines import DEFAULT
 from dvc.registration.register import refuse_one_image_twice
 from dvc.report.page import Section
-from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers
 from mrstrain.measurement.acquisition import scans_record
@@ -130,6 +129,12 @@ def register(
         expect(progress, how_long, at_once, reading_s=sum(reading_s(image.values.size) for image in images.values()))
         # Read now: what is wrong with it must not be found after an hour.
         model = None if registration.error_model is None else read_error_model(registration.error_model)
+        if model is not None and model.preset != chosen.name:
+            raise InputError(
+                f"{registration.error_model}: this error model is for {model.preset}, but the images would be "
+                f"registered with {chosen.name}. Make one with `mrstrain accuracy --preset {as_typed(chosen.name)}`, "
+                "or choose the engine of this one (engine, borders, preset)."
+            )
         points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
         if to_label:
             _hold(target, stack)
@@ -146,7 +151,6 @@ def register(
         needed = (_BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel) * voxels * len(cases)
         refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
         settings = Settings(chosen, align, running.seed, threads)
-        model = model or error_model_of(chosen.name)
         files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}, **strokes.files}
         files |= drawn
         more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
@@ -210,7 +214,7 @@ def register_one(
         subject = read_subject(load0, subject_files, onto, allow_missing=missing)
         loaded = read_image(load, allow_missing=missing)
         settings = Settings(chosen, how.align, series.seed, threads)
-        model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
+        model = None if how.error_model is None else read_error_model(how.error_model)
         floor = None if series.repeat is None else read_noise_floor(series.repeat / QUALITY)
         start = None if series.after is None else spline_in(series.after)
         more: dict[str, object] = {"allow_missing": missing, "bone_label": subject_files.bone_label}

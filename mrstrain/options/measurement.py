@@ -196,8 +196,8 @@ class EngineOptions(Options):
     """Registration engine: gauss-newton or elastix. Default: gauss-newton; with --preset or --parameters, elastix."""
     borders: Flag | None = None
     """gauss-newton: allow strain discontinuities at the tissue interfaces of --labels, or without labels at the surface
-    of the bone, as the image shows it near that of the mask. Default: on; disable it if label boundaries are wrong by
-    more than one voxel."""
+    of the bone, as the image shows it near that of the mask. Default: on, where there are labels or a bone to align on;
+    disable it if label boundaries are wrong by more than one voxel."""
     preset: str | None = None
     """Built-in elastix parameters: heel-mr."""
     parameters: tuple[Path, ...] = ()
@@ -211,7 +211,8 @@ class RecordedEngine(EngineOptions):
     """Registration engine: gauss-newton or elastix. Default: that of the measurement; with --preset or --parameters,
     elastix."""
     borders: Flag | None = None
-    """gauss-newton: allow strain discontinuities at tissue interfaces. Default: as in the measurement."""
+    """gauss-newton: allow strain discontinuities at tissue interfaces, or without labels at the bone. Default: as in
+    the measurement."""
     preset: str | None = None
     """Built-in elastix parameters: heel-mr. Default: those of the measurement, if it was made with elastix."""
     parameters: tuple[Path, ...] = ()

@@ -12,9 +12,9 @@ import numpy as np
 from dvc import Engine, engine_named
 from dvc.errors import InputError, MrstrainError
 from dvc.file_names import clash
-from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers
+from mrstrain.measurement.engines import AT_BONE
 from mrstrain.options.measurement import in_parallel
 from mrstrain.records.durations import REPORT, accuracy_runs, phantom_s
 from mrstrain.records.inputs import alone, output_folder, refuse_small_disk
@@ -42,14 +42,14 @@ _MEGABYTES = 8.0  # measured for one run's samples at 0.8 mm
 
 
 def accuracy_cases(
-    presets: Sequence[str] = (DEFAULT,), conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
+    presets: Sequence[str] = (AT_BONE,), conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
     motions: Sequence[str] = (*MOTIONS, *WAVES), seeds: Sequence[int] = SEEDS,
 ) -> list[AccuracyCase]:  # fmt: skip
     """Every preset with every condition (voxel in mm, SNR), motion and seed; shear waves with the first seed only.
 
-    By default nine motions with two heels each and eight waves, at five conditions: 130 registrations. For an engine
-    with a rigid bone, which needs labels or a bone mask, these are exact, too large and too small in turn. Waves, which
-    move bone as they move tissue, are left out for it.
+    By default the engine of `register` without labels, with nine motions of two heels each at five conditions: 90
+    registrations. For an engine with a rigid bone, its labels or bone masks are exact, too large and too small in turn,
+    and waves, which move bone as they move tissue, are left out. Other engines also get eight waves at each condition.
     """
     return [
         AccuracyCase(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if rigid else 0)
@@ -106,8 +106,8 @@ def accuracy(
     wanted = list(accuracy_cases() if cases is None else cases)
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            "Give at least one case, and each only once. Wave motions also deform bone, so they cannot be used with an "
-            "engine that keeps it rigid (gauss-newton-borders, gauss-newton-bone)."
+            "Give at least one case, and each only once. Wave motions also deform bone: use them with an engine that "
+            "does not keep it rigid, such as the preset gauss-newton (--preset gauss-newton)."
         )
     for case in wanted:
         _check(case)

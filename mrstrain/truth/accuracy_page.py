@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from dvc.registration.engines import DEFAULT
 from dvc.report.drawing import Drawing
 from dvc.report.page import Cell, Picture, Section, Table
 from dvc.trust.error_model import POOLED
@@ -17,8 +16,8 @@ from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wa
 
 _R = TypeVar("_R", ErrorRow, ResolutionRow)
 _Condition = tuple[str, str, float]
-_USUAL = (DEFAULT, "0.8", 25.0)
-"""Preset, voxel size (mm) and SNR that a page begins with, or the condition of the study that shares most of them."""
+_USUAL = (GAUSS_NEWTON, "0.8", 25.0)
+"""Engine, voxel size (mm) and SNR that a page begins with, or the condition of the study that shares most of them."""
 _TISSUES = ("fat", "muscle", "skin")
 _CONDITION = ("preset", "voxel, mm", "SNR")
 _PLACES = {
@@ -123,7 +122,8 @@ def answers(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> list[str]
 
 def _usual(conditions: Iterable[_Condition]) -> _Condition:
     """The condition that a page begins with."""
-    return max(conditions, key=lambda one: [part == wanted for part, wanted in zip(one, _USUAL, strict=True)])
+    engine, voxel, snr = _USUAL
+    return max(conditions, key=lambda one: (one[0].startswith(engine), one[1] == voxel, one[2] == snr))
 
 
 def _sentence(condition: _Condition, errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> str:

@@ -32,7 +32,7 @@ def twin(
         Unloaded image.
     deformation : path
         Total motion, rigid motion included: an elastix or ITK transform or a displacement image, such as the
-        ``TransformParameters.1.txt`` of a registered load. It maps points of ``load0`` to the loaded image, LPS mm.
+        ``transform.h5`` of a registered load. It maps points of ``load0`` to the loaded image, LPS mm.
     out : path
         Gets ``twin.nii.gz`` and ``truth/twin`` in the layout of `register`'s results.
     subject_files, frame

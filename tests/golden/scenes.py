@@ -39,11 +39,13 @@ def phantom(folder: Path, threads: int) -> Path:
 
 def smooth(folder: Path, threads: int) -> Path:
     """Gauss-Newton with one smooth spline: the plate's axes, the mesh."""
-    labels = nibabel.load(GIVEN / "tissues.nii.gz")
-    bone = (np.asarray(labels.dataobj) == 1).astype(np.uint8)
-    nibabel.save(nibabel.Nifti1Image(bone, labels.affine, labels.header), folder / "bone.nii.gz")
     plate = {"shear_direction": (0.0, -1.0, 0.0)}
-    return _registered(folder, threads, bone=folder / "bone.nii.gz", borders=False, **plate, **_MESH)
+    return _registered(folder, threads, bone=_bone_in(folder), borders=False, **plate, **_MESH)
+
+
+def at_bone(folder: Path, threads: int) -> Path:
+    """Gauss-Newton with the mask of the bone alone, and so with strain that may jump at its surface; the mesh."""
+    return _registered(folder, threads, bone=_bone_in(folder), **_MESH)
 
 
 def interfaces(folder: Path, threads: int) -> Path:
@@ -54,6 +56,14 @@ def interfaces(folder: Path, threads: int) -> Path:
 def elastix(folder: Path, threads: int) -> Path:
     """With parameters of elastix; labels for statistics by region alone."""
     return _registered(folder, threads, parameters=[GIVEN / "quick.txt"], **_LABELS)
+
+
+def _bone_in(folder: Path) -> Path:
+    """The mask of the bone, written to a folder."""
+    labels = nibabel.load(GIVEN / "tissues.nii.gz")
+    bone = (np.asarray(labels.dataobj) == 1).astype(np.uint8)
+    nibabel.save(nibabel.Nifti1Image(bone, labels.affine, labels.header), folder / "bone.nii.gz")
+    return folder / "bone.nii.gz"
 
 
 def _registered(folder: Path, threads: int, **options: object) -> Path:
@@ -99,6 +109,6 @@ def study(folder: Path, threads: int) -> Path:
 
 
 SCENES: Mapping[str, Callable[[Path, int], Path]] = {
-    made.__name__: made for made in (phantom, smooth, interfaces, elastix, linear, quadratic, study)
+    made.__name__: made for made in (phantom, smooth, at_bone, interfaces, elastix, linear, quadratic, study)
 }
 """Each makes its results in an empty folder, on so many threads, and gives the folder that they lie in."""

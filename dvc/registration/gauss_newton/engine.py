@@ -1,6 +1,7 @@
 """The Gauss-Newton engine, with one smooth spline, and with strain that may jump at tissue interfaces."""
 
 import json
+import logging
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,8 +18,17 @@ from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Fou
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.first_run import compile_loops
 from dvc.registration.gauss_newton.fit import Parameters, fit
-from dvc.registration.gauss_newton.with_interfaces import STAGE, STAGE_AT_BONE, USUAL_SKIN, fit_with_interfaces
+from dvc.registration.gauss_newton.with_interfaces import (
+    NO_RIM,
+    STAGE,
+    STAGE_AT_BONE,
+    USUAL_SKIN,
+    fit_at_bone,
+    fit_with_interfaces,
+)
 from dvc.worker import Worker
+
+_log = logging.getLogger("dvc.registration")
 
 _UNLABELLED = 0.1  # of the body: more than that was never in a phantom
 _AT_BONE = "bone_alone"  # in a record: the bone's surface is the only interface
@@ -30,11 +40,11 @@ _NOTE = (
     "no spline with discontinuities."
 )
 _NOTE_AT_BONE = (
-    "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid. This surface is placed "
-    "at the dark rim of the bone in the unloaded image, up to 2.5 mean voxel edges from that of the mask; the key "
-    "results of the bone are those of the preceding smooth spline. The whole motion, that of the bone included, is in "
-    "transform.h5, as displacements at voxels. No elastix text files are written, because elastix has no spline with "
-    "discontinuities."
+    "Strain may be discontinuous at the surface of the bone, which is constrained to be rigid. Where the unloaded "
+    "image shows the dark rim of the bone, the surface of the mask was moved there, by up to 2.5 mean voxel edges; the "
+    "key results of the bone are those of the preceding smooth spline. The whole motion, that of the bone included, is "
+    "in transform.h5, as displacements at voxels. No elastix text files are written, because elastix has no spline "
+    "with discontinuities."
 )
 
 
@@ -220,8 +230,9 @@ class GaussNewtonWithInterfaces(Engine):
 class GaussNewtonAtBone(Engine):
     """Strain may be discontinuous at the surface of the bone, which is rigid; no label map is needed.
 
-    The surface is that of the mask, moved to the outer edge of the bone's dark rim by up to 2.5 mean voxel edges, where
-    there is one.
+    The surface is that of the mask, moved to the outer edge of the bone's dark rim by up to 2.5 mean voxel edges. If
+    the unloaded image shows hardly any rim, or slices are more than 2.1 times as thick as the other voxel edges, one
+    smooth spline is fitted (`GaussNewton`); `Registration.settings` tells which engine was used.
 
     Attributes
     ----------
@@ -233,7 +244,7 @@ class GaussNewtonAtBone(Engine):
 
     family, name, note = GaussNewton.family, "gauss-newton-bone", _NOTE_AT_BONE
     needs_bone = True
-    cost = GaussNewtonWithInterfaces.cost
+    cost = Cost(2.5, 3.2, phantom_seconds=42.0, gib_per_mvoxel=0.275, bytes_per_voxel=24.0)
 
     @property
     def text(self) -> str:
@@ -265,8 +276,8 @@ class GaussNewtonAtBone(Engine):
             return ""
         return (
             f"{smooth}; starting from this result, a second B-spline was added that vanishes on the surface of the "
-            "bone, so that strain can be discontinuous there, with a rigid bone, whose surface was placed at the outer "
-            "edge of its dark rim in the unloaded image"
+            "bone, so that strain can be discontinuous there, with a rigid bone, whose surface was moved towards the "
+            "outer edge of its dark rim in the unloaded image"
         )
 
     def prepare(self) -> None:
@@ -277,9 +288,11 @@ class GaussNewtonAtBone(Engine):
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
     ) -> Found:
         """Find the displacement between the images of a pair; as in `Engine`. InputError without a bone."""
-        pair = replace(pair, labels=None)
-        displacement, choice = _run(fit_with_interfaces, pair, (self.smooth, None), start, worker, progress)
-        return Found(displacement, choice, _volume_freed(self.name, choice))
+        displacement, choice = _run(fit_at_bone, replace(pair, labels=None), (self.smooth,), start, worker, progress)
+        used = self if choice.at_interfaces else self.smooth
+        if used is not self:
+            _log.warning(NO_RIM)
+        return Found(displacement, choice, _volume_freed(used.name, choice), used)
 
 
 def _run(

@@ -39,6 +39,7 @@ _SKIN_MARGIN = 5e-4  # of the left-out residual: skin is stiff unless the images
 _STEPS = 3
 _LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps does it better with one
 _WITH_JUMPS = 1  # where the bone is the only tissue that is known
+_LEAST_SHOWN = 0.2  # of its surface shows a rim: heels have .3 and more
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
 _SMOOTH_SHARE, _DONE = 0.3, (0.6, 0.72, 0.85)  # of the time: the smooth fit, then after each of the other steps
 STAGE = {
@@ -48,28 +49,49 @@ STAGE = {
 """Every number that decides the result of this stage, for a record."""
 STAGE_AT_BONE = {
     "steps": _STEPS, "of_jumps": STAGE["of_jumps"], "distances": NUMBERS, "laplacians": _WITH_JUMPS,
-    "mean_rim": OF_RIM,
+    "mean_rim": OF_RIM, "least_shown": _LEAST_SHOWN,
 }  # fmt: skip
 """The same where the bone is the only tissue that is known."""
+NO_RIM = (
+    "One smooth spline was fitted: the unloaded image does not show the surface of the bone as the edge of a dark rim, "
+    "or its slices are too thick for it. At a surface that is off by a voxel, a strain discontinuity would do harm."
+)
+
+
+def fit_at_bone(
+    pair: AlignedPair, parameters: Parameters, start: Deformation | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> tuple[InterfaceSpline | BSpline, Choice]:  # fmt: skip
+    """As `fit_with_interfaces`, with the surface of the bone as the only interface.
+
+    The surface is moved to the outer edge of the bone's dark rim, because an interface that is off by a voxel is worse
+    than none. If the image shows hardly any of that, one smooth spline is fitted instead, which the choice tells.
+    """
+    if pair.bone is None:
+        raise InputError("A strain discontinuity at the bone needs images that are aligned on a bone mask (bone).")
+    bone, shown = bone_to_rim(pair.fixed, pair.bone, pair.body)
+    if shown < _LEAST_SHOWN:
+        smooth, choice = fit(pair, parameters, start, progress)
+        return smooth, replace(choice, rule=f"{choice.rule}. {NO_RIM[:-1]}")
+    return fit_with_interfaces(replace(pair, labels=None), parameters, None, start, progress, bone)
 
 
 def fit_with_interfaces(
     pair: AlignedPair, parameters: Parameters, skin: float | None = None, start: Deformation | None = None,
-    progress: Callable[[float], None] = lambda _: None,
+    progress: Callable[[float], None] = lambda _: None, surface: Mask | None = None,
 ) -> tuple[InterfaceSpline, Choice]:  # fmt: skip
     """Find the displacement, LPS mm, that carries the fixed image to the moving one, its gradient free at interfaces.
 
-    The pair needs labels; without them, the surface of the bone is the only interface. It is then moved to the outer
-    edge of the bone's dark rim, because an interface that is off by a voxel is worse than none. A tissue named "skin"
-    may resist strain, and the bone, if there is one, does not move. The weight k of strain in the skin, 1/mm3, is
-    chosen by cross-validation where it is not given; it becomes the choice's weight "rigidity", zero without skin. The
-    rest is as in `dvc.registration.gauss_newton.fit.fit`.
+    Interfaces are those of the pair's labels and the ``surface`` of a bone, by default the pair's. A tissue named
+    "skin" may resist strain, and the bone, if there is one, does not move. The weight k of strain in the skin, 1/mm3,
+    is chosen by cross-validation where it is not given; it becomes the choice's weight "rigidity", zero without skin.
+    The rest is as in `dvc.registration.gauss_newton.fit.fit`.
     """
     usual = replace(parameters, bending=parameters.weights.bending)
     smooth, first = fit(pair, usual, start, lambda share: progress(_SMOOTH_SHARE * share))
     axes, control = np.array(pair.fixed.grid.direction), smooth.control
     rest = None if start is None else turned(axes.T, spline_through(start, control))
-    stage = _Stage(pair, control, rest)
+    stage = _Stage(pair, surface or pair.bone, control, rest)
     weights = replace(first.weights, rigidity=(skin or USUAL_SKIN) if stage.has_skin else 0.0)
     steps, stop_mm = _STEPS * weights.patience, LEVELS[-1][-1]
     coefficients: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
@@ -102,8 +124,8 @@ def fit_with_interfaces(
 class _Stage:
     """The last stage at full resolution: in the whole body, and in a slab of it in which weights are chosen."""
 
-    def __init__(self, pair: AlignedPair, control: Grid, rest: FloatArray | None) -> None:
-        bone, inside = pair.bone if pair.labels else _at_its_rim(pair), pair.compared.inside
+    def __init__(self, pair: AlignedPair, bone: Mask | None, control: Grid, rest: FloatArray | None) -> None:
+        inside = pair.compared.inside
         labels = pair.labels or LabelMap(pair.fixed.grid, np.ones(inside.shape, dtype=int), {1: "tissue"})
         self.interfaces = Interfaces.of(labels, bone, float(control.spacing_mm.mean()), pair.body)
         soft = pair.body.inside & (self.interfaces.own != self.interfaces.rest)
@@ -122,13 +144,6 @@ class _Stage:
             for part in (np.ones_like(soft), slab)
         )
         self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & slab).any())
-
-
-def _at_its_rim(pair: AlignedPair) -> Mask:
-    """The bone as the image shows it; InputError without a bone."""
-    if pair.bone is None:
-        raise InputError("Strain discontinuities need a label map (labels), or an alignment on a bone mask.")
-    return bone_to_rim(pair.fixed, pair.bone, pair.body)
 
 
 def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:

@@ -29,7 +29,7 @@ def ball(rim: np.ndarray, snr: float = 14.0) -> Image:
 
 def off_mm(image: Image, mask: np.ndarray, side: np.ndarray) -> float:
     """How far the surface found lies from the true one on one side, root mean square, mm."""
-    found = bone_to_rim(image, Mask(GRID, mask), Mask(GRID, BODY)).inside
+    found = bone_to_rim(image, Mask(GRID, mask), Mask(GRID, BODY))[0].inside
     true = depth_mm(BONE, GRID.spacing_mm)
     error = depth_mm(found, GRID.spacing_mm) - true
     return float(np.sqrt(np.mean(error[(np.abs(true) < 0.5) & side] ** 2)))
@@ -40,6 +40,23 @@ def off_mm(image: Image, mask: np.ndarray, side: np.ndarray) -> float:
 def test_the_surface_lies_at_the_rim_wherever_the_mask_was_drawn(drawn: np.ndarray, rim: np.ndarray) -> None:
     """A mask that is off by a voxel is off by .8 mm or more."""
     assert off_mm(ball(rim), drawn, LEFT) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("image", "drawn", "least", "most"),
+    [
+        (ball(EVERYWHERE), BONE, 0.4, 1.0),
+        (ball(FROM_CENTRE[..., 0] > 0.0), BONE, 0.2, 0.4),
+        (ball(np.zeros_like(BONE)), BONE, 0.0, 0.1),
+        (ball(EVERYWHERE), binary_erosion(BONE, iterations=4), 0.0, 0.1),
+        (Image(GRID, np.where(BONE, 0.15, ball(EVERYWHERE).values)), binary_erosion(BONE), 0.0, 0.1),
+    ],
+    ids=["all around", "half", "no rim", "far inside", "all dark"],
+)
+def test_it_tells_how_much_of_the_surface_shows_a_rim(
+    image: Image, drawn: np.ndarray, least: float, most: float
+) -> None:
+    assert least <= bone_to_rim(image, Mask(GRID, drawn), Mask(GRID, BODY))[1] <= most
 
 
 def test_a_surface_without_a_rim_stays() -> None:
@@ -88,7 +105,7 @@ def test_tendon_at_the_bone_is_not_taken_for_its_rim(drawn: np.ndarray, cosine: 
 def test_on_average_a_surface_far_from_every_rim_stays() -> None:
     large, half, none = binary_dilation(BONE), FROM_CENTRE[..., 0] > 0.0, np.zeros_like(BONE)
     assert off_mm(ball(none, snr=8.0), BONE, EVERYWHERE) == 0.0
-    found = bone_to_rim(ball(half), Mask(GRID, large), Mask(GRID, BODY)).inside
+    found = bone_to_rim(ball(half), Mask(GRID, large), Mask(GRID, BODY))[0].inside
     assert np.array_equal(found[:10], large[:10])  # 14 mm from the nearest rim
     assert np.count_nonzero(found[24:] ^ BONE[24:]) < 0.4 * np.count_nonzero(large[24:] ^ BONE[24:])
 
@@ -97,7 +114,7 @@ def test_in_thick_slices_the_surface_stays() -> None:
     """In slices of 3 mm, an exact mask lost voxels at the ends of the bone."""
     grid = Grid((48, 48, 16), (1.0, 1.0, 3.0), (0.0, 0.0, 0.0))
     image, bone, body = ball(EVERYWHERE).values[:, :, ::3], binary_dilation(BONE[:, :, ::3]), BODY[:, :, ::3]
-    assert np.array_equal(bone_to_rim(Image(grid, image), Mask(grid, bone), Mask(grid, body)).inside, bone)
+    assert np.array_equal(bone_to_rim(Image(grid, image), Mask(grid, bone), Mask(grid, body))[0].inside, bone)
 
 
 def test_the_mean_is_not_of_the_other_side_of_a_thin_bone() -> None:
@@ -106,5 +123,5 @@ def test_the_mean_is_not_of_the_other_side_of_a_thin_bone() -> None:
     plate, rim = np.abs(x) < 4.5, (np.abs(x) > 3.0) & (np.abs(x) < 4.5)
     values = np.where(rim, 0.15, 1.0) + np.random.default_rng(0).normal(0.0, 0.05, plate.shape)
     aside = np.roll(plate, 1, axis=0)
-    found = bone_to_rim(Image(GRID, values.astype(np.float32)), Mask(GRID, aside), Mask(GRID, EVERYWHERE)).inside
+    found = bone_to_rim(Image(GRID, values.astype(np.float32)), Mask(GRID, aside), Mask(GRID, EVERYWHERE))[0].inside
     assert np.mean(found != plate) < 0.3 * np.mean(aside != plate)

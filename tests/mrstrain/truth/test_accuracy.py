@@ -45,7 +45,9 @@ def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
     cases = accuracy_cases()
     assert len({c.name for c in cases}) == len(cases) < 140
     assert not any(9000 <= c.seed <= 9999 for c in cases)  # set aside for published figures
-    assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
+    assert {"still", "sliding", "Load1"} <= {c.motion for c in cases}
+    assert {c.preset for c in cases} == {"gauss-newton-bone"}  # as `register` without labels
+    assert "wave-8" in {c.motion for c in accuracy_cases(("gauss-newton",))}
 
 
 def test_borders_are_studied_with_labels_that_are_right_too_large_and_too_small() -> None:

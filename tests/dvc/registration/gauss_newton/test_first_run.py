@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from dvc.registration.gauss_newton import first_run
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
 
-PREPARE = "from dvc import GaussNewtonWithInterfaces; GaussNewtonWithInterfaces().prepare()"
+PREPARE = "import dvc; dvc.{}().prepare()"
 FIT = """
 import numpy as np
 from numba.core import event
@@ -25,7 +25,8 @@ from phantoms import heel_pair
 
 heel = heel_pair(3, load=0.6, shape=(40, 44, 42), spacing_mm=2.5)  # phantoms have loops of their own
 body = Mask(heel.reference.grid, heel.labels.labels > 0)
-pair = AlignedPair.of(heel.reference, heel.loaded, heel.foot_motion, body, heel.bone, heel.labels).cut()
+labels = {}
+pair = AlignedPair.of(heel.reference, heel.loaded, heel.foot_motion, body, heel.bone, labels).cut()
 with event.install_recorder("numba:compile") as compiled:
     found, _ = fit_with_interfaces(pair, Parameters())
     strain_maps(Within(found, pair.body), pair.body)
@@ -34,14 +35,17 @@ print(sorted({e.data["dispatcher"].py_func.__name__ for _, e in compiled.buffer}
 
 
 @pytest.mark.full_size
-def test_a_fit_compiles_nothing_more(tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("engine", "labels"), [("GaussNewtonWithInterfaces", "heel.labels"), ("GaussNewtonAtBone", "None")]
+)
+def test_a_fit_compiles_nothing_more(engine: str, labels: str, tmp_path) -> None:
     there = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    for script in (PREPARE, FIT):
+    for script in (PREPARE.format(engine), FIT.replace("{}", labels, 1)):
         run = subprocess.run([sys.executable, "-c", script], env=there, capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]", run.stdout
 
 
-@pytest.mark.parametrize("engine", [GaussNewton(), GaussNewtonWithInterfaces()])
+@pytest.mark.parametrize("engine", [GaussNewton(), GaussNewtonAtBone(), GaussNewtonWithInterfaces()])
 def test_nothing_is_done_where_an_earlier_run_has_stored_its_loops(engine, monkeypatch) -> None:
     fitted = []
     monkeypatch.setattr(first_run, "_tiny_pair", lambda: fitted.append("pair"))
