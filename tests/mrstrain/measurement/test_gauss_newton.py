@@ -201,6 +201,26 @@ def test_a_load_of_a_chain_starts_from_the_result_before_it(written, tmp_path, m
     assert anew is None
 
 
+def test_without_a_rim_the_engine_of_the_record_and_of_the_error_bars_is_the_one_that_was_used(
+    tiny_pair, tmp_path, monkeypatch
+):
+    """One smooth spline, where strain may otherwise be discontinuous at the bone."""
+    monkeypatch.setattr("dvc.registration.gauss_newton.with_interfaces._LEAST_SHOWN", 2.0)
+    write_image(tmp_path / "Load0.nii.gz", tiny_pair.reference)
+    write_image(tmp_path / "Load1.nii.gz", tiny_pair.loaded)
+    write_mask(tmp_path / "bone.nii.gz", tiny_pair.bone)
+    run(
+        tmp_path / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "out", bone=tmp_path / "bone.nii.gz",
+        threads=1,
+    )  # fmt: skip
+    folder = tmp_path / "out" / "Load1"
+    assert json.loads((folder / "provenance.json").read_text())["parameters"]["borders"] is None
+    assert (folder / "TransformParameters.0.txt").exists()
+    told = json.loads((folder / "quality.json").read_text())
+    assert "One smooth spline was fitted" in told["regularisation"]["rule"]
+    assert "gauss-newton-bone" not in json.dumps(told["error_of_max_shear"])
+
+
 def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
     (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
     asked = RegistrationOptions

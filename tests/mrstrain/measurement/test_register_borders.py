@@ -323,7 +323,7 @@ def test_labels_of_the_bone_alone_hold_nothing_but_the_bone(layers, worker):
 def test_where_no_rim_shows_the_surface_of_the_bone_one_smooth_spline_is_fitted(layers, worker, caplog):
     """These images have none; at a surface a voxel off, a discontinuity is worse than none."""
     fixed, moving, body, bone = (layers[name] for name in ("reference", "loaded", "tissue", "bone"))
-    pair = AlignedPair.of(fixed, moving, RigidMotion.identity(), body, bone)
+    pair = AlignedPair.of(fixed, moving, RigidMotion.identity(), body, bone, None)
     at_bone, smooth = (
         engine.find(pair, start=None, seeds=(), worker=worker, progress=lambda *_: None)
         for engine in (GaussNewtonAtBone(FIXED), FIXED)
