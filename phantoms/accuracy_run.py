@@ -26,6 +26,7 @@ from dvc import (
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.atomic_files import whole_file
 from dvc.deformation.protocol import Motion
+from dvc.errors import RegistrationError
 from dvc.images.depth import to_surface_mm
 from dvc.images.noise import signal_to_noise
 from dvc.images.resample import shows
@@ -59,7 +60,7 @@ class AccuracyCase:
     Parameters
     ----------
     preset : str
-        "gauss-newton", "gauss-newton-borders", name of an elastix preset, or path of a parameter file (.txt).
+        "gauss-newton", "gauss-newton-bone", "gauss-newton-borders", an elastix preset, or a parameter file (.txt).
     spacing_mm : (3,)
         Voxel size, mm.
     snr : float
@@ -70,8 +71,8 @@ class AccuracyCase:
     seed : int
         Of the heel, its images and the rigid motion of the foot.
     labels_off : int
-        Voxels by which bones and skin are too large (below zero: too small) in the label map that the registration is
-        given (`misdrawn`).
+        Voxels by which bones and skin are too large (below zero: too small) in the label map, and the masks made from
+        it, that the registration is given (`misdrawn`).
     """
 
     preset: str
@@ -226,6 +227,8 @@ def measure_run(
         reference, loaded, bone=labels.region("bone"), tissue=Mask(labels.grid, labels.labels > 0), labels=labels,
         settings=settings, worker=worker, progress=told,
     )  # fmt: skip
+    if (used := registration.settings.engine.name) != settings.engine.name:
+        raise RegistrationError(f"{case.preset} was not used, but {used}: {registration.choice.caption}")
     with computing:
         return sampled_errors(case, labels, body, motion, registration)
 

@@ -12,7 +12,7 @@ from dvc.io.meshes.read import MeshFile
 from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
 from dvc.measurement.subject import Subject, plate_directions
-from dvc.registration.engines import gauss_newton
+from dvc.registration.engines import default_engine
 from dvc.registration.register import Settings, register
 from dvc.trust.error_model import ErrorModel
 from dvc.worker import Worker
@@ -91,7 +91,7 @@ def measure(
     normal, axes = plate_directions(plate_normal, shear_direction)
     pressed = plate_normal is not None or axes is not None
     subject = Subject(reference, bone, tissue, labels, mesh, normal, axes, pressed=pressed)
-    chosen = settings or Settings(gauss_newton(labelled=labels is not None, on_bone=True))
+    chosen = settings or Settings(default_engine(labelled=labels is not None, on_bone=True))
     body, floor = subject.body(), None
     with nullcontext(worker) if worker is not None else Worker(chosen.threads) as runner:
         given = {"bone": bone, "tissue": body, "labels": labels, "worker": runner, "progress": progress}

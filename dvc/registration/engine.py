@@ -153,6 +153,11 @@ class Engine(Protocol):
         """The name by which an error model is known."""
 
     @property
+    def may_be(self) -> tuple[str, ...]:
+        """Names of the engines that may be used when it is asked for, its own first."""
+        return (self.name,)
+
+    @property
     def text(self) -> str:
         """Every parameter that affects the result; an error model is valid for one such text."""
 

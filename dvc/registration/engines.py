@@ -17,7 +17,7 @@ ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in _OURS}
 """Engines that are known by one name. elastix is known by its presets and parameter files."""
 
 
-def gauss_newton(smooth: GaussNewton = _SMOOTH, *, labelled: bool, on_bone: bool) -> Engine:
+def default_engine(smooth: GaussNewton = _SMOOTH, *, labelled: bool, on_bone: bool) -> Engine:
     """The Gauss-Newton engine with every strain discontinuity that the input allows.
 
     At the tissue interfaces of a label map (``labelled``), else at the surface of the bone that images are aligned on

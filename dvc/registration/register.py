@@ -30,7 +30,7 @@ from dvc.memory import hand_memory_back
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.registration.bone_mask import mask_doubt
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
-from dvc.registration.engines import engine_named, gauss_newton
+from dvc.registration.engines import default_engine, engine_named
 from dvc.threads import most_threads, usable_cores
 from dvc.worker import Worker
 
@@ -178,7 +178,7 @@ def register(
         If the process dies.
     """
     began = time.monotonic()
-    chosen = settings or Settings(gauss_newton(labelled=labels is not None, on_bone=True))
+    chosen = settings or Settings(default_engine(labelled=labels is not None, on_bone=True))
     engine, tell = chosen.engine, progress or (lambda _stage, _fraction: None)
     refuse_one_image_twice([("The unloaded image", reference), ("the loaded one", loaded)])
     body = tissue if tissue is not None else tissue_mask(reference)

@@ -10,6 +10,7 @@ that is strained and imaged like the study's phantoms, and for no other.
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -183,6 +184,7 @@ def read_error_model(path: Path | str) -> ErrorModel:
         raise InputError(f"{path}: {what}") from failure
 
 
+@cache
 def error_model_of(preset: str) -> ErrorModel | None:
     """The error model that comes with a named preset; None where there is none."""
     stored = files("dvc.trust") / "error_models" / f"{preset}.json"

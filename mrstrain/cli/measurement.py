@@ -176,11 +176,10 @@ def accuracy(
     run resumes.
     """
     from mrstrain.measurement.engines import AT_BONE
-    from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES
+    from mrstrain.truth.accuracy import CONDITIONS, SEEDS
 
     conditions = CONDITIONS
     if spacing or snr or slice_spacing:
         conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
-    motions = motion or (*MOTIONS, *WAVES)
-    cases = mrstrain.accuracy_cases(preset or (AT_BONE,), conditions, motions, seed or SEEDS)
+    cases = mrstrain.accuracy_cases(preset or (AT_BONE,), conditions, motion, seed or SEEDS)
     carry_out(mrstrain.accuracy, out, cases=cases, workers=workers, tell_plan=say)

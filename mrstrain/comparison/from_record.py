@@ -86,14 +86,13 @@ def fill_engine(given: _E, record: MeasuredWith, *, labelled: bool) -> _E:
         return given.model_copy(update=_elastix(record))
     if family == GAUSS_NEWTON and given.borders is None:
         borders = how.get("borders")
-        at_bone = "bone_alone" in (borders or {})
-        if labelled and at_bone:
+        if labelled and "bone_alone" in (borders or {}):
             raise InputError(
                 f"{record.path}: in this measurement, strain could be discontinuous only at the surface of the bone. "
                 "Leave out the label map (labels), so that the model is measured in the same way."
             )
-        if borders is None or at_bone:  # the latter is then refused, not left out, without an alignment on the bone
-            return given.model_copy(update={"borders": at_bone})
+        if borders is None:
+            return given.model_copy(update={"borders": False})
     return given.model_copy(update={"engine": family}) if family not in (None, DEFAULT) else given
 
 

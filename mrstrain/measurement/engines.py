@@ -10,7 +10,7 @@ from dvc import (
     read_parameter_file,
 )
 from dvc.errors import InputError, ParameterError
-from dvc.registration.engines import DEFAULT, ENGINES, gauss_newton
+from dvc.registration.engines import DEFAULT, ENGINES, default_engine
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 
@@ -51,7 +51,7 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
                 "`borders` needs a label map: labels (--labels), or images aligned on the bone: align bone (--align "
                 "bone). Otherwise leave it out."
             )
-        return gauss_newton(smooth, labelled=labelled, on_bone=how.align == "bone")
+        return default_engine(smooth, labelled=labelled, on_bone=how.align == "bone")
     if bending is not None or volume is not None:
         raise ParameterError(f"bending and volume are only for the engine {GAUSS_NEWTON}; the engine is {name}.")
     if borders:

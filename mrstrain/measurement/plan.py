@@ -73,13 +73,13 @@ class Plan:
         measured = dvc.Measurement.from_registration(
             found, self.subject, evidence, name=folder.name, is_repeat=is_repeat
         )
-        record = {**self.record, **noise_record(measured), "parameters": self._parameters(found)}
+        record = {**self.recorded(found), **noise_record(measured)}
         return Case.of(measured, folder, record), measured.quality.noise_floor
 
-    def _parameters(self, found: dvc.Registration) -> dict[str, object]:
-        """Those of the record, with the engine that was used, which may not be the one asked for."""
+    def recorded(self, found: dvc.Registration) -> dict[str, object]:
+        """The record with the engine that was used, which may not be the one asked for."""
         asked: Mapping[str, object] = self.record["parameters"]  # type: ignore[assignment]
-        return {**asked, **found.settings.engine.record()}
+        return {**self.record, "parameters": {**asked, **found.settings.engine.record()}}
 
 
 def _load_what_draws() -> None:

@@ -129,7 +129,7 @@ def register(
         expect(progress, how_long, at_once, reading_s=sum(reading_s(image.values.size) for image in images.values()))
         # Read now: what is wrong with it must not be found after an hour.
         model = None if registration.error_model is None else read_error_model(registration.error_model)
-        if model is not None and model.preset != chosen.name:
+        if model is not None and model.preset not in chosen.may_be:
             raise InputError(
                 f"{registration.error_model}: this error model is for {model.preset}, but the images would be "
                 f"registered with {chosen.name}. Make one with `mrstrain accuracy --preset {as_typed(chosen.name)}`, "
@@ -175,7 +175,7 @@ def register(
     shown = [case for case in finished if case.name != REPEAT]
     answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
     advice = next_step(subject_files, cases, scans, registration, chosen)
-    series = Series.of(target, finished, run.failures, record, answer, of_labels, advice=advice)
+    series = Series.of(target, finished, run.failures, run.record, answer, of_labels, advice=advice)
     tell(REPORT, WRITING, 1.0)
     return series
 
@@ -259,6 +259,7 @@ class _Run:
     ) -> None:
         self.out, self.plan, self.images, self.start, self._tell = out, plan, images, start, tell
         self.cases: dict[str, Case] = {}
+        self.record = plan.record  # with the engine that was used, once that is known
         self.errors: dict[str, MrstrainError] = {}
         self._floor: NoiseFloor | None = None
         self._telling, self._writing = threading.Lock(), threading.Lock()
@@ -281,6 +282,7 @@ class _Run:
                 if not not_begun:
                     threading.Thread(target=worker.close).start()  # its memory is as large as what the maps take now
                 if not is_repeat:
+                    self.record = self.plan.recorded(done[0])
                     last.append(done[0].displacement)
                     self._floor_known.wait()
                 with self._writing:

@@ -43,22 +43,38 @@ _MEGABYTES = 8.0  # measured for one run's samples at 0.8 mm
 
 def accuracy_cases(
     presets: Sequence[str] = (AT_BONE,), conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
-    motions: Sequence[str] = (*MOTIONS, *WAVES), seeds: Sequence[int] = SEEDS,
+    motions: Sequence[str] | None = None, seeds: Sequence[int] = SEEDS,
 ) -> list[AccuracyCase]:  # fmt: skip
     """Every preset with every condition (voxel in mm, SNR), motion and seed; shear waves with the first seed only.
 
     By default the engine of `register` without labels, with nine motions of two heels each at five conditions: 90
     registrations. For an engine with a rigid bone, its labels or bone masks are exact, too large and too small in turn,
     and waves, which move bone as they move tissue, are left out. Other engines also get eight waves at each condition.
+
+    Raises
+    ------
+    InputError
+        If waves are asked for with an engine that keeps the bone rigid.
     """
+    rigid = {preset: _keeps_bone_rigid(engine_named(preset)) for preset in presets}
+    if any(rigid.values()) and any(map(_is_wave, motions or ())):
+        kept = ", ".join(preset for preset in presets if rigid[preset])
+        raise InputError(
+            f"Wave motions also deform bone, which {kept} keeps rigid. Leave them out, or use an engine that does not, "
+            "such as the preset gauss-newton (--preset gauss-newton)."
+        )
     return [
-        AccuracyCase(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if rigid else 0)
-        for preset, rigid in [(preset, _keeps_bone_rigid(engine_named(preset))) for preset in presets]
+        AccuracyCase(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if rigid[preset] else 0)
+        for preset in presets
         for spacing, snr in conditions
-        for m, motion in enumerate(motions)
-        if not (rigid and motion.startswith("wave-"))
-        for s, seed in enumerate(seeds[:1] if motion.startswith("wave-") else seeds)
+        for m, motion in enumerate(motions or (*MOTIONS, *WAVES))
+        if not (rigid[preset] and _is_wave(motion))
+        for s, seed in enumerate(seeds[:1] if _is_wave(motion) else seeds)
     ]
+
+
+def _is_wave(motion: str) -> bool:
+    return motion.startswith("wave-")
 
 
 def _keeps_bone_rigid(engine: Engine) -> bool:
@@ -105,10 +121,7 @@ def accuracy(
     """
     wanted = list(accuracy_cases() if cases is None else cases)
     if not wanted or len(set(wanted)) < len(wanted):
-        raise InputError(
-            "Give at least one case, and each only once. Wave motions also deform bone: use them with an engine that "
-            "does not keep it rigid, such as the preset gauss-newton (--preset gauss-newton)."
-        )
+        raise InputError("Give at least one case, and each only once.")
     for case in wanted:
         _check(case)
     target, folder = Path(out), Path(out) / "runs"

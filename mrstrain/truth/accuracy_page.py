@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from dvc.registration.engines import ENGINES
 from dvc.report.drawing import Drawing
 from dvc.report.page import Cell, Picture, Section, Table
 from dvc.trust.error_model import POOLED
@@ -16,8 +17,8 @@ from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wa
 
 _R = TypeVar("_R", ErrorRow, ResolutionRow)
 _Condition = tuple[str, str, float]
-_USUAL = (GAUSS_NEWTON, "0.8", 25.0)
-"""Engine, voxel size (mm) and SNR that a page begins with, or the condition of the study that shares most of them."""
+_USUAL = ("0.8", 25.0)
+"""Voxel size (mm) and SNR that a page begins with, or the condition of the study that shares most of them."""
 _TISSUES = ("fat", "muscle", "skin")
 _CONDITION = ("preset", "voxel, mm", "SNR")
 _PLACES = {
@@ -52,7 +53,7 @@ HOW_TO_READ = Section(
         "constrained bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as "
         "strong as under the forces of the published experiment), attached-Load1 and attached-Load3 (tissue attached "
         "to bone, where its strain is largest), wave-L (shear that varies as a cosine of wavelength L mm). Labels +1 "
-        "or -1: bones and skin are one voxel too large, or too small, in the label map that the "
+        "or -1: bones and skin are one voxel too large, or too small, in the label map or bone mask that the "
         "registration was given.",
         "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. A finer resolution "
         "means more noise, so report both.",
@@ -122,8 +123,8 @@ def answers(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> list[str]
 
 def _usual(conditions: Iterable[_Condition]) -> _Condition:
     """The condition that a page begins with."""
-    engine, voxel, snr = _USUAL
-    return max(conditions, key=lambda one: (one[0].startswith(engine), one[1] == voxel, one[2] == snr))
+    voxel, snr = _USUAL
+    return max(conditions, key=lambda one: (one[0] in ENGINES, one[1] == voxel, one[2] == snr))
 
 
 def _sentence(condition: _Condition, errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> str:

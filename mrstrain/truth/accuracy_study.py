@@ -131,5 +131,5 @@ def _source(runs: Sequence[ErrorSamples]) -> str:
     source = f"{len(runs)} registrations of phantom heels, seeds {seeds}, motions {motions}"
     if any(r.case.labels_off for r in runs):
         off = ", ".join(f"{by:+d}" for by in sorted({r.case.labels_off for r in runs}))
-        source += f", bones and skin in label maps too large by {off} voxels"
+        source += f", bones and skin in label maps or masks too large by {off} voxels"
     return source

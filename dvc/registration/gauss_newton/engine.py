@@ -247,6 +247,11 @@ class GaussNewtonAtBone(Engine):
     cost = Cost(2.5, 3.2, phantom_seconds=42.0, gib_per_mvoxel=0.275, bytes_per_voxel=24.0)
 
     @property
+    def may_be(self) -> tuple[str, ...]:
+        """Names of the engines that may be used: its own, or that of one smooth spline."""
+        return (self.name, self.smooth.name)
+
+    @property
     def text(self) -> str:
         """Every number that affects the result, as JSON: those of the smooth spline and of the last stage."""
         return json.dumps(json.loads(self.smooth.text) | {"borders": {_AT_BONE: STAGE_AT_BONE}})
@@ -289,10 +294,10 @@ class GaussNewtonAtBone(Engine):
     ) -> Found:
         """Find the displacement between the images of a pair; as in `Engine`. InputError without a bone."""
         displacement, choice = _run(fit_at_bone, replace(pair, labels=None), (self.smooth,), start, worker, progress)
-        used = self if choice.at_interfaces else self.smooth
-        if used is not self:
-            _log.warning(NO_RIM)
-        return Found(displacement, choice, _volume_freed(used.name, choice), used)
+        if choice.at_interfaces:
+            return Found(displacement, choice, _volume_freed(self.name, choice))
+        _log.warning(f"{NO_RIM}.")
+        return Found(displacement, choice, _volume_freed(self.smooth.name, choice), self.smooth)
 
 
 def _run(

@@ -39,7 +39,7 @@ _SKIN_MARGIN = 5e-4  # of the left-out residual: skin is stiff unless the images
 _STEPS = 3
 _LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps does it better with one
 _WITH_JUMPS = 1  # where the bone is the only tissue that is known
-_LEAST_SHOWN = 0.2  # of its surface shows a rim: heels have .3 and more
+_LEAST_SHOWN = 0.2  # of its surface shows a rim: heels have .29 and more
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
 _SMOOTH_SHARE, _DONE = 0.3, (0.6, 0.72, 0.85)  # of the time: the smooth fit, then after each of the other steps
 STAGE = {
@@ -53,8 +53,8 @@ STAGE_AT_BONE = {
 }  # fmt: skip
 """The same where the bone is the only tissue that is known."""
 NO_RIM = (
-    "One smooth spline was fitted: the unloaded image does not show the surface of the bone as the edge of a dark rim, "
-    "or its slices are too thick for it. At a surface that is off by a voxel, a strain discontinuity would do harm."
+    "One smooth spline was fitted: around the mask of the bone, the unloaded image does not show the surface of the "
+    "bone as the edge of a dark rim, or its slices are too thick for it. Check the mask"
 )
 
 
@@ -72,7 +72,7 @@ def fit_at_bone(
     bone, shown = bone_to_rim(pair.fixed, pair.bone, pair.body)
     if shown < _LEAST_SHOWN:
         smooth, choice = fit(pair, parameters, start, progress)
-        return smooth, replace(choice, rule=f"{choice.rule}. {NO_RIM[:-1]}")
+        return smooth, replace(choice, rule=f"{choice.rule}. {NO_RIM}")
     return fit_with_interfaces(replace(pair, labels=None), parameters, None, start, progress, bone)
 
 

@@ -204,8 +204,12 @@ def test_several_stages_have_no_known_error() -> None:
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
     found.settings = Settings(Elastix((replace(load_preset("heel-mr"), name="mine"),)))
-    bars = bars_of(found, subject, maps, error_model_of("mine"))
-    assert "mine has not been measured" in bars.explanation
+    assert "mine has not been measured" in bars_of(found, subject, maps, None).explanation
+
+
+def test_without_a_model_of_ones_own_the_built_in_one_of_the_engine_is_taken() -> None:
+    found, subject, maps = given()
+    assert bars_of(found, subject, maps, None).uncertainty is not None
 
 
 def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
@@ -332,6 +336,7 @@ def test_a_model_as_it_was_made_is_seldom_doubted() -> None:
 
 def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
     found, subject, maps = given()
+    found.settings = Settings(Elastix((replace(load_preset("heel-mr"), name="mine"),)))
     bars = bars_of(found, subject, maps, None, twin_of(maps, 0.05))
     assert bars.uncertainty is None
     (row,) = bars.twin
@@ -341,6 +346,7 @@ def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
     assert table.columns == ("region", "error (rms)", "bias")
     assert bars.of_twin.startswith("not known. In the synthetic warp of this pair, the error (rms)")
     assert "is fat 0.05" in bars.of_twin
+    found.settings = Settings.of("heel-mr")
     failed = bars_of(found, subject, maps, model(), TwinCheck(None, "The deformation folds."))
     assert failed.twin == ()
     assert failed.of_twin.endswith("the synthetic warp of this pair has no result. The deformation folds.")
@@ -359,7 +365,7 @@ def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
     assert folded.reasons == ("It folds.", doubted.reasons[0])
 
 
-@pytest.mark.parametrize("name", ["gauss-newton", "gauss-newton-borders", "heel-mr"])
+@pytest.mark.parametrize("name", ["gauss-newton", "gauss-newton-bone", "gauss-newton-borders", "heel-mr"])
 def test_our_own_engine_and_the_preset_for_heels_come_with_their_error(name: str) -> None:
     stored = error_model_of(name)
     assert stored is not None

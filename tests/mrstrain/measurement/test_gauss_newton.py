@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvc.errors import ParameterError, RegistrationError
+from dvc.errors import InputError, ParameterError, RegistrationError
 from dvc.images.image import Image
 from dvc.io.images.labels import read_mask
 from dvc.io.images.read import read_image
@@ -21,6 +21,7 @@ from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone,
 from dvc.registration.gauss_newton.fit import USUAL_BENDING, USUAL_VOLUME
 from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings
+from dvc.trust.error_model import error_model_of
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.register import register as run, register_one
 from mrstrain.options.measurement import RegistrationOptions
@@ -214,7 +215,8 @@ def test_without_a_rim_the_engine_of_the_record_and_of_the_error_bars_is_the_one
         threads=1,
     )  # fmt: skip
     folder = tmp_path / "out" / "Load1"
-    assert json.loads((folder / "provenance.json").read_text())["parameters"]["borders"] is None
+    for place in (folder, folder.parent):
+        assert json.loads((place / "provenance.json").read_text())["parameters"]["borders"] is None
     assert (folder / "TransformParameters.0.txt").exists()
     told = json.loads((folder / "quality.json").read_text())
     assert "One smooth spline was fitted" in told["regularisation"]["rule"]
@@ -261,3 +263,15 @@ def test_the_twin_of_a_pair_is_measured_again_and_told(tiny_pair, tmp_path):
     assert "Check by a synthetic warp of this pair" in (tmp_path / "out" / "report.html").read_text()
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert record["parameters"]["twin"] is True
+
+
+def test_an_error_model_of_another_engine_is_refused_before_anything_runs(written, tmp_path):
+    """That of one smooth spline is taken: it is used if no rim shows the surface of the bone."""
+    given = written / "Load0.nii.gz", [written / "Load1.nii.gz"]
+    error_model_of("gauss-newton-borders").write(tmp_path / "gauss-newton-borders.json")
+    with pytest.raises(InputError, match=r"is for gauss-newton-borders, but .* gauss-newton-bone"):
+        run(
+            *given, out=tmp_path / "o", bone=written / "bone.nii.gz", error_model=tmp_path / "gauss-newton-borders.json"
+        )
+    assert not (tmp_path / "o" / "Load1").exists()
+    assert "gauss-newton" in GaussNewtonAtBone().may_be
