@@ -12,7 +12,7 @@ _SKIN, _TENDON = "skin", "tendon"
 _NO_INTERFACES = "gauss-newton", "gauss-newton-bone"  # at the skin
 _OF_SKIN = (
     "No standard uncertainty of the max. shear in skin: without strain discontinuities at tissue interfaces, it "
-    "covered only 83 % of the voxels where the fat pad slides."
+    "covered only 80 to 83 % of the voxels where the fat pad slides."
 )
 _OF_TENDON = (
     "No standard uncertainty of displacement and strain components in tendon: under single motions, it covered as few "
