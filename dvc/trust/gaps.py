@@ -16,7 +16,7 @@ _OF_SKIN = (
 )
 _OF_TENDON = (
     "No standard uncertainty of displacement and strain components in tendon: under single motions, it covered as few "
-    "as 79 % of the voxels."
+    "as 78 % of the voxels."
 )
 _OF_MADE_SKIN = (
     "No intervals in skin: on phantoms whose fat pad slides, with a label map made from the image, they contained "
