@@ -282,8 +282,8 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
             raise InputError(f"The {name} is empty: all voxels are 0. Choose another file.")
     if bone is not None and settings.align_on == "bone" and not (bone.inside & body.inside).any():
         raise InputError(
-            "The bone lies outside the tissue mask, which has to contain it. Check that bone (--bone) and tissue "
-            "(--tissue) are of this image, or leave the tissue mask out."
+            "The bone mask lies outside the body. Check that bone (--bone), and the tissue mask if one was given "
+            "(--tissue), are of this image."
         )
     if bone is not None and (share := float(np.mean(bone.inside[body.inside]))) > _MOSTLY_BONE:
         raise InputError(

@@ -306,8 +306,8 @@ def test_missing_voxels_are_left_out(tiny_pair, worker):
     ("given", "told"),
     [
         ({"engine": "gauss-newton"}, "Settings.of"),
-        ({"align_on": "bones"}, "bone or image or none"),
-        ({"threads": 0}, "1 to 256"),
+        ({"engine": GaussNewton(), "align_on": "bones"}, "bone or image or none"),
+        ({"engine": GaussNewton(), "threads": 0}, "1 to 256"),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused_when_they_are_made(given, told):

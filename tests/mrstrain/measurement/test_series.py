@@ -175,11 +175,11 @@ def test_row_8_one_image_given_twice_is_refused_before_anything_is_made(spy, sca
 
 
 def test_row_17_a_disk_too_small_for_all_loads_is_told_first(spy, scans, tmp_path, monkeypatch):
-    """101,000 voxels at 30 bytes: 3 MB for each image."""
+    """101,000 voxels at 54 bytes: 6 MB for each image."""
     arguments = {"out": tmp_path / "new" / "out", "bone": scans / "bone.nii.gz"}
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 4 * 10**6))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 7 * 10**6))
     both = [scans / "Load1.nii.gz", scans / "Load2.nii.gz"]
-    with pytest.raises(OutputError, match="the results of 2 images need about 7 MB, but the disk has only 4 MB left"):
+    with pytest.raises(OutputError, match="the results of 2 images need about 12 MB, but the disk has only 7 MB left"):
         register(scans / "Load0.nii.gz", both, **arguments)
     assert not (tmp_path / "new").exists()
     assert register(scans / "Load0.nii.gz", both[:1], **arguments).cases

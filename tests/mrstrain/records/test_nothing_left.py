@@ -86,7 +86,7 @@ REFUSED: dict[str, tuple[str, Give]] = {
         "Only 1 voxels of the mask",
         lambda out, files: mrstrain.register(LOAD0, [LOAD1], out=out, bone=bone(files, voxels=1), workers=1)),
     "register, bone in the air": (
-        "rigid alignment on the bone failed",
+        "The bone mask lies outside the body",
         lambda out, files: mrstrain.register(LOAD0, [LOAD1], out=out, bone=bone(files), workers=1)),
     "register, the whole image as bone": (
         "The bone mask covers 100 % of the body, so there is no soft tissue",

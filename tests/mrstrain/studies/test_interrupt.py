@@ -168,6 +168,7 @@ def works_below(process: psutil.Process) -> bool:
 
 def measuring_accuracy(images: Path, folder: Path) -> Case:
     command = ["accuracy", "--out", str(folder / "out"), "--spacing", "3", "--seed", "1", "--workers", "1"]
+    command += ["--preset", "gauss-newton"]
     motions = [given for name in ("still", "Load1", "Load2") for given in ("--motion", name)]
     run, report = folder / "out" / "runs" / "gauss-newton_3x3x3mm_snr25_still_1.npz", folder / "out/report.html"
     return Case([*command, *motions], lambda _: run.is_file(), run, report)
