@@ -159,10 +159,10 @@ def coverage() -> Figure:
         one.axvline(95, color="k", linewidth=0.6, linestyle=":")
         for engine, up in engines:
             label, colour = ENGINES[engine]
-            shares = [100.0 * told[engine][motion][column] for motion in rows]
+            shares = [100.0 * told[engine].get(motion, {}).get(column, np.nan) for motion in rows]
             one.plot(shares, np.arange(len(rows)) + up, MARKERS[colour][0], color=colour, label=label, markersize=5)
         one.grid(visible=False)
-        one.set(title=title, xlim=(80, 101), xticks=(80, 90, 95, 100))
+        one.set(title=title, xlim=(78, 101), xticks=(80, 90, 95, 100))
         one.set_yticks(range(len(rows)), [MOTIONS[m] for m in rows] if column == "fat" else [], fontsize=8)
     axes[1].legend(fontsize=7, loc="upper left")
     figure.supxlabel("voxels whose true strain lies within 1.96 standard uncertainties, %", fontsize=9)
