@@ -228,7 +228,10 @@ def measure_run(
         settings=settings, worker=worker, progress=told,
     )  # fmt: skip
     if (used := registration.settings.engine.name) != settings.engine.name:
-        raise RegistrationError(f"{case.preset} was not used, but {used}: {registration.choice.caption}")
+        raise RegistrationError(
+            f"At this voxel size and noise, the images were registered with {used} instead of {case.preset}. Choose "
+            f"smaller voxels or thinner slices, or measure {used} (--preset {used})."
+        )
     with computing:
         return sampled_errors(case, labels, body, motion, registration)
 

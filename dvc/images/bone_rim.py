@@ -44,8 +44,8 @@ def reach_of(spacing_mm: FloatArray) -> float:
 def bone_to_rim(image: Image, bone: Mask, body: Mask) -> tuple[Mask, float]:
     """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
 
-    Also the share of this surface from which the distance is known: .29 to .94 on phantom heels, 0 without a rim, in a
-    cortex thicker than the surface can move, and if the mask is two voxels too small.
+    It comes with the share of the mask's surface at which this distance is known: .29 to .94 on phantom heels, about 0
+    without a rim, in a cortex thicker than the surface can move, and if the mask is two voxels too small.
 
     The distance is averaged on the surface in a neighbourhood of 6 mm (standard deviation; less in a thin bone), which
     corrects a mask that is too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects
