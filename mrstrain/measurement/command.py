@@ -5,30 +5,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
+
+from mrstrain.measurement import guard
 
 _ONE_THREAD = {"OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"}
 """Variables by which the stages of a study keep to a core each."""
 _LOOK_EVERY_S = 5.0
 _WORKS = 0.01  # of a core: less is what a program takes to wait
 _SAID_BYTES = 1 << 16
-_GUARD = """
-import os, signal, sys, time
-sys.stdin.read()
-try:
-    os.killpg(int(sys.argv[1]), signal.SIGTERM)
-    for _ in range(30):
-        time.sleep(0.1)
-        os.killpg(int(sys.argv[1]), 0)
-    os.killpg(int(sys.argv[1]), signal.SIGKILL)
-except ProcessLookupError:
-    pass
-"""
-"""Ends a process group, by force after 3 s, when its standard input is closed."""
 
 
 def run_command(parts: Sequence[str], folder: Path, goes_on: Callable[[float], None]) -> tuple[int, str]:
@@ -50,53 +39,37 @@ def run_command(parts: Sequence[str], folder: Path, goes_on: Callable[[float], N
     """
     free = {name: value for name, value in os.environ.items() if name not in _ONE_THREAD}
     began, computed_s = time.monotonic(), 0.0
+    guarded = [sys.executable, "-I", "-S", guard.__file__, *parts]  # it is there before the command, and ends it
     with (
         tempfile.TemporaryFile() as said,  # not a pipe, which what it leaves behind could keep open
         subprocess.Popen(
-            parts, cwd=folder, env=free, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT,
-            process_group=0,
+            guarded, cwd=folder, env=free, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said,
+            start_new_session=True,
         ) as running,
-        _guarded(running),
     ):  # fmt: skip
-        while True:
-            try:
-                code = running.wait(_LOOK_EVERY_S)
-                break
-            except subprocess.TimeoutExpired:
-                before, computed_s = computed_s, _computed_s(running.pid)
-                if computed_s - before > _WORKS * _LOOK_EVERY_S:
-                    goes_on(time.monotonic() - began)
+        assert running.stdin is not None
+        assert running.stdout is not None
+        with running.stdin:  # closed with the block, or with this process, even if that is killed
+            while True:
+                try:
+                    running.wait(_LOOK_EVERY_S)
+                    break
+                except subprocess.TimeoutExpired:
+                    before, computed_s = computed_s, _computed_s(running.pid)
+                    if computed_s - before > _WORKS * _LOOK_EVERY_S:
+                        goes_on(time.monotonic() - began)
+        *what, code = running.stdout.read().decode().split() or [str(running.returncode)]
+        if what == ["cannot", "start"]:
+            raise OSError(int(code), os.strerror(int(code)))
         said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
-        return code, said.read().decode(errors="replace")
-
-
-@contextmanager
-def _guarded(running: "subprocess.Popen[bytes]") -> Iterator[None]:
-    """End a command and all that it started with this block, or with this process, even if it is killed."""
-    if not hasattr(os, "killpg"):  # no groups of processes
-        try:
-            yield
-        finally:
-            running.kill()
-        return
-    guard = [sys.executable, "-I", "-S", "-c", _GUARD, str(running.pid)]
-    with subprocess.Popen(
-        guard, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    ) as guarding:
-        try:
-            yield
-        finally:
-            assert guarding.stdin is not None
-            guarding.stdin.close()
-            running.wait()  # the guard sees it as long as nobody has asked for its status
+        return int(code), said.read().decode(errors="replace")
 
 
 def _computed_s(process: int) -> float:
-    """Processor time of a process and all below it, with those that have ended, seconds."""
+    """Processor time of all below a process, with those that have ended, seconds."""
     seconds = 0.0
     with suppress(psutil.Error):
-        first = psutil.Process(process)
-        for one in (first, *first.children(recursive=True)):
+        for one in psutil.Process(process).children(recursive=True):
             with suppress(psutil.Error):
                 seconds += sum(one.cpu_times()[:4])
     return seconds

@@ -133,6 +133,20 @@ def test_what_a_command_leaves_behind_is_ended(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+def test_a_command_ends_with_a_process_that_is_killed_at_its_first_instruction(tmp_path):
+    (tmp_path / "run.py").write_text(
+        "import os, pathlib\nfrom mrstrain.measurement.command import run_command\n"
+        "pathlib.Path('above').write_text(str(os.getpid()))\n"
+        "run_command(['sh', '-c', 'echo $$ > below; kill -9 $(cat above); exec sleep 1000'], '.', print)\n"
+    )
+    for _ in range(5):
+        above = subprocess.run([sys.executable, "run.py"], cwd=tmp_path, check=False)
+        assert above.returncode == -signal.SIGKILL
+        below = int((tmp_path / "below").read_text())
+        wait_for(lambda: is_gone(below), limit_s=OVER_S)  # noqa: B023
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
 def test_a_study_that_is_ended_leaves_no_segmenter(folder, by):
     segmenter = "sh -c 'sleep 1000 & echo $! $$ > processes; sleep 1000' {image} {labels}"
