@@ -3,8 +3,7 @@
     .venv/bin/python -m benchmarks.no_equilibrium heel.vtu --out benchmarks/results/no_equilibrium.json
 
 Materials are those of the set trebbi but for one: fat of 10 Pa, a skin whose stress falls, or one whose stress falls
-steeply. One thread; told are seconds of processor time, which other programs change little, linear solutions, and the
-fraction of the load that is reached.
+steeply. Told are seconds, seconds of processor time, linear solutions, and the fraction of the load that is reached.
 """
 
 from __future__ import annotations
@@ -43,11 +42,12 @@ def main() -> None:
     Solver.solve = counted  # type: ignore[method-assign, assignment]
     rows = []
     for name, (tissue, law) in MISTAKEN.items():
-        solutions[0], began = 0, time.process_time()
+        solutions[0], began, computed = 0, time.perf_counter(), time.process_time()
         done = fe.simulate(mesh, {**sound, tissue: law}, fe.Plate(DOWN, FORWARD), [LOAD])
-        seconds = round(time.process_time() - began, 1)
+        seconds, processor_s = round(time.perf_counter() - began, 1), round(time.process_time() - computed, 1)
         reached = round(done.states[0].reached, 3)
-        rows.append({"material": name, "seconds": seconds, "solutions": solutions[0], "reached": reached})
+        cost = {"seconds": seconds, "processor_s": processor_s, "solutions": solutions[0]}
+        rows.append({"material": name, **cost, "reached": reached})
         print(rows[-1], flush=True)
     given.out.write_text(json.dumps({"versions": versions(), "cells": len(mesh.cells), "rows": rows}, indent=1) + "\n")
 

@@ -29,9 +29,9 @@ _FIRST_MM, _MOST_MM, _LEAST_MM = (0.25, 1.0), (1.0, 3.0), (0.01, 0.25)
 _MOST_OTHERWISE_MM = 0.6  # under displacement control, and with a plate that rotates: 1.0 is less exact (decision 7)
 _CLOSE_MM = 0.01
 # With a material whose stiffness is far from every published one, or whose stress falls, and below this fraction of the
-# normal load: least steps, of a stage and mm, and how many may be left to the load once a step has failed. Smaller and
-# more steps, and viscous descent, took minutes to fail.
-_EARLY, _LEAST_DOUBTED, _LEAST_DOUBTED_MM, _MOST_DOUBTED = 0.5, 1.0 / 32.0, 0.1, 50
+# normal load: least steps, of a stage and mm, how many may be left to the load once a step has failed, and iterations
+# of a step. Smaller and more steps, more iterations, and forces after displacements have failed, took minutes to fail.
+_EARLY, _LEAST_DOUBTED, _LEAST_DOUBTED_MM, _MOST_DOUBTED, _DOUBTED_ITERATIONS = 0.5, 1.0 / 32.0, 0.1, 50, 15
 # Fraction of a force up to which the plate is displacement controlled, so that nodes touch it in order. A plate that
 # rotates is released at the first fraction at which it does not tip over, once enough nodes touch.
 _ENOUGH, _RELEASED = 0.8, (0.2, 0.4, 0.6, 0.8)
@@ -115,8 +115,8 @@ class LoadPath:
                 part = PlateTarget(self._start_mm + share * way, target.displaced).unsheared()
                 if part.values[0] > self.plate.displacement_mm[0] and not self.raise_to(part):
                     return False
-            else:
-                self._move(0, target.unsheared(), share)
+            elif not self._move(0, target.unsheared(), share):
+                return False
             if self.is_over():
                 return False
             if not self.contact.plate.turns or self._let_go():
@@ -153,8 +153,7 @@ class LoadPath:
         pressed, grows = abs(normal - normal_n) <= _PRESSED * abs(normal_n), shear_n * (shear_n - shear) > 0.0
         if self.contact.plate.turns or target.displaced.any() or not (pressed and grows):
             return self.raise_to(target)
-        self._move(1, target, _ENOUGH)
-        return self.raise_to(target, self._last_step(1, target))
+        return self._move(1, target, _ENOUGH) and self.raise_to(target, self._last_step(1, target))
 
     def _last_step(self, axis: int, target: PlateTarget) -> float:
         """First step to a force, as a fraction: the whole way where the displaced plate has come near."""
@@ -170,7 +169,8 @@ class LoadPath:
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
             step = min(step, largest)
             share = min(1.0, done + step)
-            if self._go(target.displaced, before + share * way, downhill=downhill):
+            tolerance = self._tolerance(self.tolerance, self.reached(target)[0], target.values[0])
+            if self._go(target.displaced, before + share * way, downhill=downhill, tolerance=tolerance):
                 done, step = share, step if downhill else step * _GROWTH
                 self._log(f"{100 * done:.0f} % of this stage")
                 self.on_converged()
@@ -184,10 +184,10 @@ class LoadPath:
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 
-    def _move(self, axis: int, target: PlateTarget, share: float) -> None:
+    def _move(self, axis: int, target: PlateTarget, share: float) -> bool:
         """Displace the plate along an axis until its force is a fraction of the target's, or cannot rise; never above.
 
-        Along the other axes it has the forces of the target.
+        Along the other axes it has the forces of the target. Returns whether there is hope for more.
         """
         aim_n = float(target.values[axis])
         ahead = 1.0 if aim_n > 0.0 else -1.0
@@ -204,7 +204,8 @@ class LoadPath:
                 break
             last, aim = self.increment, target.values.copy()
             aim[axis] = self._start_mm[axis] + ahead * (moved_mm + step)
-            converged = self._go(np.arange(3) == axis, aim, tolerance=rough)
+            tolerance = self._tolerance(rough, self.plate.force_n[0], target.values[0])
+            converged = self._go(np.arange(3) == axis, aim, tolerance=tolerance)
             # Beyond the largest shear force that tissue carries, no state is on the way.
             rises = axis == 0 or ahead * (self.plate.force_n[axis] - last[1].force_n[axis]) > 0.0
             if converged and rises and ahead * self.plate.force_n[axis] < abs(aim_n):
@@ -216,7 +217,8 @@ class LoadPath:
             if not converged and self._hopeless(self.plate.force_n[0], target.values[0]):
                 left = self._to_force(axis, _AIM * aim_n) / largest
                 if largest < _LEAST_DOUBTED_MM or _MOST_DOUBTED < left < np.inf:
-                    break
+                    return False
+        return True
 
     def _moved(self, axis: int, ahead: float) -> float:
         """Displacement of the plate along an axis, or against it, since it touched the tissue, mm."""
@@ -225,6 +227,10 @@ class LoadPath:
     def _hopeless(self, reached: float, normal: float) -> bool:
         """Whether no smaller step is tried after one that failed: far from the normal load, with a doubted material."""
         return self._doubted and reached < _EARLY * normal
+
+    def _tolerance(self, tolerance: Tolerance, reached: float, normal: float) -> Tolerance:
+        """The tolerance of a step, with few iterations where no smaller one would be tried."""
+        return replace(tolerance, iterations=_DOUBTED_ITERATIONS) if self._hopeless(reached, normal) else tolerance
 
     def _to_force(self, axis: int, force_n: float) -> float:
         """Step along an axis to a force, mm, if the force goes on to grow by the same factor with each mm."""

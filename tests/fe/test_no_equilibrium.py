@@ -1,7 +1,9 @@
 """What cannot reach equilibrium ends with its cause, after a limited number of steps.
 
 A step is one linear solution. Processor time is looked at too, so that "within a minute" is more than a number of
-steps; it was 2 s at most.
+steps; it was 3 s at most. The four materials that are told to be odd took 64, 57, 186 and 97 steps, 164, 122, 256 and
+115 without their limits on iterations and on forces after displacements, and up to 600 where smaller steps and viscous
+descent are tried too. Rounding, which differs between processors, changes the numbers.
 """
 
 import re
@@ -15,12 +17,8 @@ from fe.linear import Solver
 from tests.fe.test_simulate import ALONG, DOWN, FAT, SKIN, dome
 
 MOST_STEPS, MINUTE = 1000, 60.0
-# With a material that is told to be odd, for which smaller steps and viscous descent are not tried: 122 to 256, and 411
-# to over 600 where they are. Rounding, which differs between processors, changes the numbers.
-DOUBTED_STEPS = 350
 FALLING = Yeoh.of(0.03, c20_mpa=-0.02)
 SOFT = NeoHooke.of(1e-5)  # 10 Pa
-FAR_STEPS = 170  # where the load is more than fifty increments away: 115, and 225 where they are taken all the same
 SOFT_IN_MPA = r"modulus of 0.01 kPa, .* Are they in MPa, entered as kPa\?"
 FALLS = r"stable \(rising stress\) only at"
 TOLD = "no equilibrium was found beyond"
@@ -48,10 +46,10 @@ class Counted:
 @pytest.mark.parametrize(
     ("skin", "fat", "load", "cause", "most"),
     [
-        (FALLING, FAT, LoadStep("a", 40.0), FALLS, DOUBTED_STEPS),
-        (Yeoh.of(0.01, c20_mpa=-0.1), FAT, LoadStep("a", 40.0, 10.0), FALLS, DOUBTED_STEPS),
-        (SKIN, SOFT, LoadStep("a", 2.0), SOFT_IN_MPA, DOUBTED_STEPS),
-        (SKIN, SOFT, LoadStep("a", 140.0), SOFT_IN_MPA, FAR_STEPS),
+        (FALLING, FAT, LoadStep("a", 40.0), FALLS, 120),
+        (Yeoh.of(0.01, c20_mpa=-0.1), FAT, LoadStep("a", 40.0, 10.0), FALLS, 100),
+        (SKIN, SOFT, LoadStep("a", 2.0), SOFT_IN_MPA, 230),
+        (SKIN, SOFT, LoadStep("a", 140.0), SOFT_IN_MPA, 170),
         (SKIN, FAT, LoadStep("a", 2.0, 300.0), "nearly inverted", MOST_STEPS),
     ],
     ids=["falling skin", "falling steeply", "fat of 10 Pa", "fat of 10 Pa far from its load", "sheared too far"],
