@@ -49,14 +49,16 @@ def interrupted(
         before = computed_s(family)
         (os.killpg if group else os.kill)(process.pid, by)
         began, after = time.monotonic(), dict(before)
-        said = by != signal.SIGINT
+        said, said_s = by != signal.SIGINT, 0.0
         while process.poll() is None or not all(is_gone(one.pid) for one in below):
             passed = time.monotonic() - began
-            said = said or "Stopping." in err.read_text()
+            if not said and "Stopping." in err.read_text():
+                said, said_s = True, passed
             assert said or passed < SAID_S, "it did not say so in time"
             assert passed < OVER_S, "it is not over"
             after |= computed_s(family)
             time.sleep(0.05)
+        print(f"{command[0]}: told after {said_s:.1f} s, over after {time.monotonic() - began:.1f} s")
         assert sum(after.values()) - sum(before.values()) < COMPUTED_S, "it went on"
         told = err.read_text()
         assert by != signal.SIGINT or "Stopping." in told, "it did not say so"
