@@ -284,6 +284,12 @@ class InterfaceSpline:
         """Distance (3,) between the control points along their axes, mm."""
         return self.control.spacing_mm
 
+    @property
+    def bone(self) -> Mask | None:
+        """The rigid bone up to where strain may be discontinuous, with the air nearest to it; None without one."""
+        borders = self.borders
+        return None if borders.rest < 0 else Mask(borders.grid, borders.own == borders.rest)
+
     def turned(self, rotation: FloatArray) -> Self:
         """The same displacement of a body that is turned, with its borders, about the world's origin."""
         return type(self)(self.smooth.turned(rotation), self.jump.turned(rotation), self.borders.turned(rotation))

@@ -48,6 +48,13 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))
 
 
+def moved_mm(before: BoolArray, after: BoolArray, spacing_mm: FloatArray) -> tuple[float, float]:
+    """Mean and root mean square of how far the border of a mask moved outward, mm; voxels of (3,) mm."""
+    was = depth_mm(before, spacing_mm)
+    off = (depth_mm(after, spacing_mm) - was)[np.abs(was) < 0.5 * float(spacing_mm.mean())]
+    return (float(off.mean()), float(np.sqrt((off**2).mean()))) if off.size else (0.0, 0.0)
+
+
 def to_surface_mm(body: BoolArray, spacing_mm: FloatArray) -> Float32Array:
     """Distance (mm) of voxels' centres to the surface of a body of voxels: 0 inside it, infinite without one.
 

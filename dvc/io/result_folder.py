@@ -33,6 +33,7 @@ MAX_SHEAR, JACOBIAN, VALID = "max_shear.nii.gz", "jacobian.nii.gz", "valid.nii.g
 ALIGNED, REGISTERED = "aligned.nii.gz", "registered.nii.gz"
 SPLINE, SPLINE_WITH_BORDERS = ELASTIX_FILES[0], INTERFACE_SPLINE
 ITK_TRANSFORM = "transform.h5"
+BONE_USED = "bone_used.nii.gz"
 SIGMA, BIAS = "sigma_max_shear.nii.gz", "bias_max_shear.nii.gz"
 INTERVALS, ERROR_MODEL = "intervals.csv", "error_model.json"
 SIGMA_NORMAL, SIGMA_SHEAR = "sigma_normal_strain.nii.gz", "sigma_shear_strain.nii.gz"

@@ -13,7 +13,7 @@ from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
 from dvc.images.bone_names import is_bones_name
 from dvc.images.bone_rim import bones_to_rims, reach_of
-from dvc.images.depth import depth_mm
+from dvc.images.depth import depth_mm, moved_mm
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import tissue_mask, within
@@ -121,7 +121,7 @@ def correct_labels(
     corrected = np.where(new_bones, _nearest(given, bones), np.where(new_skin, _nearest(given, skin), 0))
     corrected = np.where(body & ~new_bones & ~new_skin, _nearest(given, others), corrected)
     moved = {
-        name: _moved(was, now, spacing)
+        name: moved_mm(was, now, spacing)
         for name, was, now in (("bone", bones, new_bones), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
         if (was & body).any()
     }
@@ -172,10 +172,3 @@ def _nearest(labels: IntArray, where: BoolArray) -> IntArray:
     if not where.any():
         return labels
     return np.asarray(labels[tuple(distance_transform_edt(~where, return_distances=False, return_indices=True))])
-
-
-def _moved(before: BoolArray, after: BoolArray, spacing_mm: FloatArray) -> tuple[float, float]:
-    """Mean and root mean square of how far a boundary moved outward, mm."""
-    was = depth_mm(before, spacing_mm)
-    off = (depth_mm(after, spacing_mm) - was)[np.abs(was) < 0.5 * float(spacing_mm.mean())]
-    return (float(off.mean()), float(np.sqrt((off**2).mean()))) if off.size else (0.0, 0.0)

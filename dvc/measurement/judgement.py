@@ -8,11 +8,12 @@ import numpy as np
 from dvc.arrays import Float32Array, FloatArray
 from dvc.deformation.protocol import RigidMotion, displacement_on_grid
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
+from dvc.images.depth import moved_mm
 from dvc.images.image import Image, Mask
 from dvc.images.resample import Carrier, shows
 from dvc.images.similarity import Windows, brightness_offset, local_correlation
 from dvc.io import result_folder as files
-from dvc.io.images.write import write_image
+from dvc.io.images.write import write_image, write_mask
 from dvc.io.transforms.write import write_displacement_as_found, write_itk_transform
 from dvc.measurement.error_bars import TwinCheck
 from dvc.measurement.subject import Subject
@@ -130,6 +131,8 @@ def write_images_and_transforms(folder: Path, found: Registration, images: Carri
     grid, motion = found.reference.grid, found.alignment.motion
     write_image(folder / files.ALIGNED, Image(grid, images.aligned))
     write_image(folder / files.REGISTERED, Image(grid, images.registered))
+    if found.bone_used is not None:
+        write_mask(folder / files.BONE_USED, found.bone_used)
     write_displacement_as_found(found.displacement, folder, motion, grid)
     write_itk_transform(folder / files.ITK_TRANSFORM, found.displacement, motion, grid)
 
@@ -142,7 +145,10 @@ def motion_as_dict(motion: RigidMotion) -> dict[str, object]:
 
 def alignment_of(found: Registration) -> dict[str, object]:
     """The alignment as plain values: motion, how well it is known, and by what the pair was registered."""
-    alignment = found.alignment
+    alignment, used = found.alignment, found.bone_used
+    moved = {}
+    if used is not None and found.bone is not None:
+        moved = {"bone_surface_moved_mm": list(moved_mm(found.bone.inside, used.inside, used.grid.spacing_mm))}
     return {
         "on": alignment.on,
         **motion_as_dict(alignment.motion),
@@ -151,5 +157,6 @@ def alignment_of(found: Registration) -> dict[str, object]:
         "repeatability_rms_mm": plain(alignment.repeatability_mm),
         "control_spacing_mm": found.displacement.spacing_mm.tolist(),
         "engine": found.settings.engine.family,
+        **moved,
         "seconds": round(found.seconds, 1),
     }

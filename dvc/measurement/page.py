@@ -59,6 +59,8 @@ def drawings_of(
         drawn["overlay"] = Drawing.of("Before and after", figures.overlay, *pair)
         drawn["checkerboard"] = Drawing.of("Checkerboard", figures.checkerboard, *pair)
         drawn["similarity"] = Drawing.of("Local similarity of the images", figures.similarity_slices, *local)
+    if made.registration is not None and bone is not None and (used := made.registration.bone_used) is not None:
+        drawn["bone_used"] = Drawing.of("Surface of the bone", figures.bone_slices, reference, bone, used)
     under = None if images is None else Image(reference.grid, images.registered)
     drawn["strain"] = strain_drawing(view, made.subject, labels, maps.max_shear, under, loaded=loaded)
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
@@ -117,6 +119,12 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
             (spread, alignment["repeatability_rms_mm"], "mm"),
             ("Engine of the non-rigid registration", alignment["engine"], ""),
             ("Control point spacing of the B-spline", spacing, "mm"),
+        ]
+    if "bone_surface_moved_mm" in alignment:
+        mean_mm, rms_mm = alignment["bone_surface_moved_mm"]
+        rows += [
+            ("Surface of the bone, moved to its dark rim: mean (above 0: outward)", mean_mm, "mm"),
+            ("Surface of the bone, moved to its dark rim: rms", rms_mm, "mm"),
         ]
     if quality.similarity is not None:
         each = zip(("as scanned", "after rigid alignment", "after registration"), quality.similarity, strict=True)

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from dvc.arguments import check, checked
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
+from dvc.deformation.interface_spline import InterfaceSpline
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion, Within
 from dvc.errors import InputError, ParameterError
 from dvc.images.bias_field import without_bias_field
@@ -137,6 +138,18 @@ class Registration:
     def deformation(self) -> Deformation:
         """Displacement of tissue relative to its bone; defined in the tissue (and one voxel around it)."""
         return Within(self.displacement, self.tissue)
+
+    @property
+    def bone_used(self) -> Mask | None:
+        """The bone in the tissue, with its surface where the engine placed it; None if the engine does not place it."""
+        used = self.displacement.bone if isinstance(self.displacement, InterfaceSpline) else None
+        if used is None or self.bone is None or not self.settings.engine.needs_bone:
+            return None
+        inside, grid = np.zeros_like(self.bone.inside), self.bone.grid
+        start = np.rint(grid.toward_lps().indices_of(used.grid.origin_mm)).astype(int)
+        box = tuple(slice(at, at + n) for at, n in zip(start, used.grid.shape, strict=True))
+        reordered_to_lps(grid, inside)[box] = used.inside  # of a part of the image
+        return Mask(grid, inside & self.tissue.inside)
 
     @property
     def total(self) -> Deformation:

@@ -21,7 +21,7 @@ from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import GeometryError, InputError
-from dvc.images.image import Image, LabelMap
+from dvc.images.image import Image, LabelMap, Mask
 from dvc.report.chart import chart, label_axes, legend
 from dvc.report.sheet import AXES, PLANES, UNSEEN, Plane, Sheet, Values, View, levelled, window_of
 from dvc.report.style import BAND, BOLD, ON_DARK, TISSUES, looks
@@ -211,6 +211,21 @@ def coloured(
     pointed = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}
     sheet.bar(colours, norm, scale.told, pointed[beyond])
     return sheet
+
+
+def bone_slices(reference: Image, given: Mask, used: Mask) -> Figure:
+    """The unloaded image around the bone. Blue: the mask as given. Orange: where strain may be discontinuous.
+
+    The orange line should follow the outer edge of the bone's dark rim. Where it does not, correct the mask.
+    """
+    view = View.through(reference.grid, None, given.inside | used.inside)
+    sheet = Sheet(view, [""])
+    window = window_of(view, reference.values)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, reference.values, window)
+        for bone, colour in ((given, "#56D4FF"), (used, "#FFB000")):
+            sheet.outlines(plane, axes, [view.cut(bone.inside, plane)], colour)
+    return sheet.finished()
 
 
 def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> Figure:

@@ -10,11 +10,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from dvc.errors import GeometryError, InputError
-from dvc.images.image import Grid, Image, LabelMap
+from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.report import figures
 from dvc.report.drawing import png_bytes
 from dvc.report.sheet import LETTERS, PLANES, UNSEEN, Plane, Sheet, View
@@ -146,6 +147,7 @@ DRAWN: dict[str, Callable[[np.ndarray], Figure]] = {
     "similarity": lambda a: figures.similarity_slices(VIEW, a, a),
     "curves": lambda a: figures.shear_curves(a, LABELS, noise_floor=0.04),
     "grid": lambda a: figures.deformed_grid(VIEW, a, MOVED, RADIUS < 6),
+    "bone": lambda _: figures.bone_slices(REFERENCE, Mask(GRID, RADIUS < 7), Mask(GRID, RADIUS < 6)),
 }
 
 
@@ -195,6 +197,17 @@ def test_strain_without_a_value_leaves_the_image_plain() -> None:
     zero = np.zeros(GRID.shape, dtype=np.float32)
     assert saturated(pixels(figures.strain_slices(VIEW, REFERENCE, NOTHING, 0.5))) < 0.01
     assert saturated(pixels(figures.strain_slices(VIEW, REFERENCE, zero, 0.5))) > 0.5
+
+
+def test_the_bone_has_a_line_for_the_mask_and_one_for_the_surface_that_is_used() -> None:
+    def share(given: float, used: float, colour: str) -> float:
+        masks = (Mask(GRID, r > RADIUS) for r in (given, used))
+        page = pixels(figures.bone_slices(REFERENCE, *masks))
+        return float((np.abs(page - np.array(to_rgb(colour))).max(axis=-1) < 0.1).mean())
+
+    orange, blue = "#FFB000", "#56D4FF"
+    assert share(9.0, 6.0, blue) > share(9.0, 6.0, orange) > 0.001
+    assert share(6.0, 6.0, blue) < 0.2 * share(9.0, 6.0, blue)  # the line of the surface covers that of the mask
 
 
 def test_a_strain_that_fades_leaves_outlines_and_the_colour_bar() -> None:

@@ -132,6 +132,16 @@ def test_the_bone_mask_alone_lets_strain_jump_at_the_bone(pad, tmp_path):
     assert isinstance(spline_in(folder), InterfaceSpline)
     told = json.loads((folder / "quality.json").read_text())
     assert told["regularisation"]["rigidity_of"] is None  # the bone cannot be strained
+    used, given = read_mask(folder / "bone_used.nii.gz").inside, read_mask(mask).inside
+    assert np.nanmax(shear[None][used]) == 0.0
+    assert np.count_nonzero(used ^ bone.inside) < 0.5 * np.count_nonzero(given ^ bone.inside)
+    mean_mm, rms_mm = told["alignment"]["bone_surface_moved_mm"]
+    assert -1.6 < mean_mm < -0.8
+    assert rms_mm < 2.0
+    assert "Surface of the bone, moved to its dark rim: mean" in (tmp_path / "None" / "report.html").read_text()
+    assert (folder / "figures" / "bone_used.pdf").is_file()
+    smooth = tmp_path / "False" / "Load1"
+    assert not [*smooth.glob("bone_used*"), *smooth.glob("figures/bone_used*")]
     record = json.loads((tmp_path / "None" / "provenance.json").read_text())["parameters"]
     assert record["borders"] == {"bone_alone": True}
     assert "vanishes on the surface of the bone" in methods_of(record, {})
