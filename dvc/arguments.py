@@ -103,7 +103,8 @@ def _misfit(name: str, value: object, hint: Any) -> tuple[str, object, Any] | No
     """What of a value is not of the kind of a hint; arrays and literal values are left to who takes them."""
     hint = _meant(hint)
     if isinstance(hint, TypeVar):
-        hint = Union[hint.__constraints__]  # noqa: UP007 - of a tuple
+        kinds = hint.__constraints__ or (hint.__bound__ or object,)
+        hint = Union[kinds]  # noqa: UP007 - of a tuple
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (UnionType, Union):
         misfits = [_misfit(name, value, each) for each in inner]

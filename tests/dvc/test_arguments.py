@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, get_origin
+from typing import Any, TypeVar, get_origin
 
 import numpy as np
 import pytest
@@ -156,3 +156,14 @@ def test_what_lies_on_a_grid_is_shown_in_a_line() -> None:
     assert repr(MASK) == f"Mask({grid})"
     assert repr(LABELS) == f"LabelMap({grid}, names={{1: 'bone'}})"
     assert repr(GRID) == f"Grid({GRID})"
+
+
+def test_a_type_variable_takes_what_it_may_stand_for() -> None:
+    """NumPy 2.5 has some without limits in its ArrayLike, which was an error of typing's own."""
+    free, bound, either = TypeVar("free"), TypeVar("bound", bound=dvc.Mask), TypeVar("either", dvc.Mask, dvc.Image)
+    check("it", "anything", free)
+    check("it", MASK, bound)
+    check("it", IMAGE, either)
+    for hint in (bound, either):
+        with pytest.raises(InputError, match=r"^it must be .*dvc\.Mask.*; got LabelMap"):
+            check("it", LABELS, hint)
