@@ -41,7 +41,7 @@ from dvc import (
     register,
     write_labels,
 )
-from dvc.arrays import FloatArray
+from dvc.arrays import FloatArray, IntArray
 from dvc.trust.error_model import error_model_of
 from dvc.worker import Worker
 from fe import read_tet_mesh, write_tet_mesh
@@ -148,7 +148,7 @@ def simulated(work: Path, kind: str) -> tuple[Path, LabelMap]:
     return folder, labels
 
 
-def divided(mesh: Path, out: Path, kind_of: Callable[[FloatArray], FloatArray]) -> Path:
+def divided(mesh: Path, out: Path, kind_of: Callable[[FloatArray], IntArray]) -> Path:
     """The mesh with several kinds of fat, by the kind (0, 1 ...) of the positions (n, 3), LPS mm, of its cells."""
     plain = read_tet_mesh(mesh)
     fat = plain.regions["fat"]
@@ -159,7 +159,7 @@ def divided(mesh: Path, out: Path, kind_of: Callable[[FloatArray], FloatArray]) 
     return out
 
 
-def mixed(points_mm: FloatArray, labels: LabelMap, seed: int) -> FloatArray:
+def mixed(points_mm: FloatArray, labels: LabelMap, seed: int) -> IntArray:
     """Three kinds of fat, in lobules of 6 mm."""
     width = 6.0 / 2.355 / VOXEL_MM[0]
     shape = [n + int(np.ceil(6.0 * width)) for n in labels.grid.shape]
@@ -168,11 +168,11 @@ def mixed(points_mm: FloatArray, labels: LabelMap, seed: int) -> FloatArray:
     return np.asarray(np.digitize(values[tuple(at.T)], np.quantile(values[tuple(at.T)], [1 / 3, 2 / 3])))
 
 
-def layered(points_mm: FloatArray, labels: LabelMap, _seed: int) -> FloatArray:
+def layered(points_mm: FloatArray, labels: LabelMap, _seed: int) -> IntArray:
     """Two kinds of fat: that within some millimetres of the skin, and that below."""
     from_skin = distance_transform_edt(~labels.region("skin").inside, sampling=labels.grid.spacing_mm)
     at = np.rint(labels.grid.indices_of(points_mm)).astype(int)
-    return np.asarray(from_skin[tuple(at.T)] > STIFF_LAYER_MM, dtype=float)
+    return np.asarray(from_skin[tuple(at.T)] > STIFF_LAYER_MM, dtype=int)
 
 
 def modelled(work: Path, case: AccuracyCase, worker: Worker) -> ErrorSamples:
