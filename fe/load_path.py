@@ -176,7 +176,8 @@ class LoadPath:
                 self.on_converged()
                 continue
             step *= _SHRINK
-            if self._hopeless(self.reached(target)[0], target.values[0]) and step < min(_LEAST_DOUBTED, 0.15 * largest):
+            cut_short = self._cut_short(self.reached(target)[0], target.values[0])
+            if cut_short and step < min(_LEAST_DOUBTED, 0.15 * largest):
                 break
             stays = self.contact.plate.taped and not self.contact.status.turns
             # if Newton's method fails under force control, viscous descent takes over
@@ -187,7 +188,7 @@ class LoadPath:
     def _move(self, axis: int, target: PlateTarget, share: float) -> bool:
         """Displace the plate along an axis until its force is a fraction of the target's, or cannot rise; never above.
 
-        Along the other axes it has the forces of the target. Returns whether there is hope for more.
+        Along the other axes it has the forces of the target. False if the search was cut short.
         """
         aim_n = float(target.values[axis])
         ahead = 1.0 if aim_n > 0.0 else -1.0
@@ -214,23 +215,25 @@ class LoadPath:
                 continue
             self._back(last)
             largest = _SHRINK * step
-            if not converged and self._hopeless(self.plate.force_n[0], target.values[0]):
+            if not converged and self._cut_short(self.plate.force_n[0], target.values[0]):
                 left = self._to_force(axis, _AIM * aim_n) / largest
                 if largest < _LEAST_DOUBTED_MM or _MOST_DOUBTED < left < np.inf:
-                    return False
+                    return self.contact.plate.turns
         return True
 
     def _moved(self, axis: int, ahead: float) -> float:
         """Displacement of the plate along an axis, or against it, since it touched the tissue, mm."""
         return ahead * float(self.plate.displacement_mm[axis] - self._start_mm[axis])
 
-    def _hopeless(self, reached: float, normal: float) -> bool:
-        """Whether no smaller step is tried after one that failed: far from the normal load, with a doubted material."""
+    def _cut_short(self, reached: float, normal: float) -> bool:
+        """Whether the search for equilibrium is cut short: far below the normal load, with a doubted material."""
         return self._doubted and reached < _EARLY * normal
 
     def _tolerance(self, tolerance: Tolerance, reached: float, normal: float) -> Tolerance:
-        """The tolerance of a step, with few iterations where no smaller one would be tried."""
-        return replace(tolerance, iterations=_DOUBTED_ITERATIONS) if self._hopeless(reached, normal) else tolerance
+        """The tolerance of a step; where the search is cut short and the plate keeps parallel, with few iterations."""
+        if self.contact.plate.turns or not self._cut_short(reached, normal):
+            return tolerance
+        return replace(tolerance, iterations=min(tolerance.iterations, _DOUBTED_ITERATIONS))
 
     def _to_force(self, axis: int, force_n: float) -> float:
         """Step along an axis to a force, mm, if the force goes on to grow by the same factor with each mm."""

@@ -36,7 +36,8 @@ class Tolerance:
         ten times it (at most .1 %), the last below 0.1 mm, are also accepted, because the nodes of a nearly flat cell
         may move almost without force.
     iterations : int
-        Largest number of iterations.
+        Largest number of iterations; at most 15 below half of the normal load with a material that is far from every
+        published one.
     """
 
     force: float = 1e-4

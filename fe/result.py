@@ -85,7 +85,7 @@ def why_not_reached(state: LoadState, materials: Materials) -> str:
     least = float(state.strain.jacobian.min())
     steps = ", even with small increments"
     if doubts("", materials):
-        steps = " (a material is unusual: below half of the normal load, few and no small increments are tried)"
+        steps = " (a material is unusual: below half of the normal load, the search is cut short)"
     return (
         f"no equilibrium was found beyond {100 * state.reached:.0f} % of the load{steps}; "
         f"{'cells are nearly inverted' if least < CROWDED else 'the tissue probably became unstable'} "

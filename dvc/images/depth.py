@@ -1,7 +1,7 @@
 """Distances from the border of a mask: of voxels' faces, or finer than its voxels."""
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 from scipy.special import ndtri
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
@@ -11,6 +11,7 @@ _BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
 _SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
 _NEAR = 1.0  # voxels
 _EVEN = 0.7  # voxels
+_BESIDE = 8  # voxels around masks that are compared
 _LEAST_MM = 0.05  # every voxel stays on its own side of the border
 NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm": _LEAST_MM}
 """Every number that determines where a border lies, for a record."""
@@ -49,9 +50,18 @@ def depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
 
 
 def moved_mm(before: BoolArray, after: BoolArray, spacing_mm: FloatArray) -> tuple[float, float]:
-    """Mean and root mean square of how far the border of a mask moved outward, mm; voxels of (3,) mm."""
-    was = depth_mm(before, spacing_mm)
-    off = (depth_mm(after, spacing_mm) - was)[np.abs(was) < 0.5 * float(spacing_mm.mean())]
+    """Mean and root mean square of how far the border of a mask moved outward, mm; voxels of (3,) mm.
+
+    At the voxels on either side of the border; (0, 0) if the mask has none.
+    """
+    some = np.argwhere(before | after)
+    if not len(some):
+        return 0.0, 0.0
+    low, high = np.maximum(some.min(axis=0) - _BESIDE, 0), some.max(axis=0) + _BESIDE + 1
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))  # of which the image may be several times as large
+    before, after = before[box], after[box]
+    border = binary_dilation(before) & ~binary_erosion(before, border_value=1)
+    off = (depth_mm(after, spacing_mm) - depth_mm(before, spacing_mm))[border]
     return (float(off.mean()), float(np.sqrt((off**2).mean()))) if off.size else (0.0, 0.0)
 
 

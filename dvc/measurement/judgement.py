@@ -148,7 +148,8 @@ def alignment_of(found: Registration) -> dict[str, object]:
     alignment, used = found.alignment, found.bone_used
     moved = {}
     if used is not None and found.bone is not None:
-        moved = {"bone_surface_moved_mm": list(moved_mm(found.bone.inside, used.inside, used.grid.spacing_mm))}
+        given = found.bone.inside & found.tissue.inside
+        moved = {"bone_surface_moved_mm": list(moved_mm(given, used.inside, used.grid.spacing_mm))}
     return {
         "on": alignment.on,
         **motion_as_dict(alignment.motion),

@@ -8,7 +8,7 @@ import numpy as np
 
 from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import StrainMaps
-from dvc.images.image import Image, LabelMap
+from dvc.images.image import Image, LabelMap, Mask
 from dvc.measurement.error_bars import ErrorBars
 from dvc.measurement.judgement import Source
 from dvc.measurement.subject import Subject
@@ -60,7 +60,8 @@ def drawings_of(
         drawn["checkerboard"] = Drawing.of("Checkerboard", figures.checkerboard, *pair)
         drawn["similarity"] = Drawing.of("Local similarity of the images", figures.similarity_slices, *local)
     if made.registration is not None and bone is not None and (used := made.registration.bone_used) is not None:
-        drawn["bone_used"] = Drawing.of("Surface of the bone", figures.bone_slices, reference, bone, used)
+        shown = reference, Mask(reference.grid, bone.inside & made.tissue.inside), used
+        drawn["bone_used"] = Drawing.of("Surface of the bone", figures.bone_slices, *shown)
     under = None if images is None else Image(reference.grid, images.registered)
     drawn["strain"] = strain_drawing(view, made.subject, labels, maps.max_shear, under, loaded=loaded)
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
@@ -123,8 +124,8 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     if "bone_surface_moved_mm" in alignment:
         mean_mm, rms_mm = alignment["bone_surface_moved_mm"]
         rows += [
-            ("Surface of the bone, moved to its dark rim: mean (above 0: outward)", mean_mm, "mm"),
-            ("Surface of the bone, moved to its dark rim: rms", rms_mm, "mm"),
+            ("Distance of the bone surface used from that of the mask, mean (positive: outward)", mean_mm, "mm"),
+            ("Distance of the bone surface used from that of the mask, rms", rms_mm, "mm"),
         ]
     if quality.similarity is not None:
         each = zip(("as scanned", "after rigid alignment", "after registration"), quality.similarity, strict=True)

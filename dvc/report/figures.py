@@ -216,7 +216,8 @@ def coloured(
 def bone_slices(reference: Image, given: Mask, used: Mask) -> Figure:
     """The unloaded image around the bone. Blue: the mask as given. Orange: where strain may be discontinuous.
 
-    The orange line should follow the outer edge of the bone's dark rim. Where it does not, correct the mask.
+    The orange line should follow the outer edge of the bone's dark rim. Where it does not, correct the mask. Both are
+    drawn in the tissue only. Slices through the middle of the bone.
     """
     view = View.through(reference.grid, None, given.inside | used.inside)
     sheet = Sheet(view, [""])

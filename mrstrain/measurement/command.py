@@ -1,5 +1,6 @@
 """A user's command, such as a segmenter: it and all that it starts end with this process, however that ends."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -49,7 +50,7 @@ def run_command(parts: Sequence[str], folder: Path, goes_on: Callable[[float], N
     ):  # fmt: skip
         assert running.stdin is not None
         assert running.stdout is not None
-        with running.stdin:  # closed with the block, or with this process, even if that is killed
+        try:
             while True:
                 try:
                     running.wait(_LOOK_EVERY_S)
@@ -58,9 +59,14 @@ def run_command(parts: Sequence[str], folder: Path, goes_on: Callable[[float], N
                     before, computed_s = computed_s, _computed_s(running.pid)
                     if computed_s - before > _WORKS * _LOOK_EVERY_S:
                         goes_on(time.monotonic() - began)
-        *what, code = running.stdout.read().decode().split() or [str(running.returncode)]
-        if what == ["cannot", "start"]:
+        finally:
+            running.stdin.close()  # as at the end of this process, even if it is killed: the guard ends the command
+            running.wait()
+        what, _, code = running.stdout.read().decode().strip().rpartition(" ")
+        if what == "cannot start":
             raise OSError(int(code), os.strerror(int(code)))
+        if what != "ended":
+            raise ChildProcessError(errno.ECHILD, "the process that watches over it was killed")
         said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
         return int(code), said.read().decode(errors="replace")
 

@@ -19,7 +19,7 @@ def _end(running: "subprocess.Popen[bytes]") -> None:
     if not hasattr(os, "killpg"):  # no groups of processes
         running.kill()
         return
-    with suppress(ProcessLookupError):
+    with suppress(OSError):  # there are none left, or only those of another user
         os.killpg(running.pid, signal.SIGTERM)
         until = time.monotonic() + _GRACE_S
         while time.monotonic() < until:
@@ -35,6 +35,8 @@ def _end_with_input(running: "subprocess.Popen[bytes]") -> None:
 
 
 def _main(parts: list[str]) -> None:
+    if os.name == "nt":  # elsewhere a session of its own keeps Ctrl-C away
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         running = subprocess.Popen(
             parts, stdin=subprocess.DEVNULL, stdout=sys.stderr, stderr=sys.stderr, process_group=0
@@ -42,10 +44,10 @@ def _main(parts: list[str]) -> None:
     except OSError as error:
         print("cannot start", error.errno)
         return
+    signal.signal(signal.SIGTERM, lambda *_: _end(running))
     threading.Thread(target=_end_with_input, args=(running,), daemon=True).start()
-    status = running.wait()
+    print("ended", running.wait(), flush=True)
     _end(running)
-    print("ended", status)
 
 
 if __name__ == "__main__":

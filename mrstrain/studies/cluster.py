@@ -21,6 +21,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, Nanny, get_w
 from dvc.errors import WorkerError
 from dvc.memory import is_lack_of_memory
 from dvc.threads import usable_cores
+from mrstrain.measurement import guard
 from mrstrain.records.outcome import lack_of_machine
 from mrstrain.records.progress import NOTE, OnProgress, duration
 from mrstrain.studies.scheduler import at_address
@@ -30,7 +31,8 @@ from mrstrain.studies.stages import StageResult
 _MOST_LOST = 3
 _WORKER = "Dask Worker process"  # begins the name of the process of a worker
 _TRIED = "This was computed at the second attempt."
-_TRACKER = "resource_tracker"  # removes the semaphores of processes that are gone, then ends by itself
+# What ends by itself: removes the semaphores of processes that are gone; ends a user's command with who asked for it.
+_SPARED = "resource_tracker", guard.__file__
 _NOTHING_LOGGED = logging.CRITICAL + 1  # by Dask, as of each message that there is no memory for: stages tell of theirs
 _LOOK_EVERY_S, _LOST_S = 1.0, 120.0  # an interrupt may be seen only at the next look
 _STARTS_S = 900.0  # for a worker whose process starts: over two minutes where ten others want the same core
@@ -356,7 +358,7 @@ def _with_all_below(pid: int | None) -> list[psutil.Process]:
 def _kill(processes: Sequence[psutil.Process]) -> None:
     for process in processes:
         with suppress(psutil.Error):
-            if not any(_TRACKER in word for word in process.cmdline()):
+            if not any(spared in word for word in process.cmdline() for spared in _SPARED):
                 process.kill()
 
 

@@ -3,7 +3,8 @@
 A step is one linear solution. Processor time is looked at too, so that "within a minute" is more than a number of
 steps; it was 3 s at most. The four materials that are told to be odd took 64, 57, 186 and 97 steps, 164, 122, 256 and
 115 without their limits on iterations and on forces after displacements, and up to 600 where smaller steps and viscous
-descent are tried too. Rounding, which differs between processors, changes the numbers.
+descent are tried too; the last took 225 without a limit on the steps that may be left to the load. Rounding, which
+differs between processors, changes the numbers.
 """
 
 import re
@@ -64,7 +65,7 @@ def test_it_ends_within_a_minute_with_its_cause(
     notes = " ".join(done.notes)
     assert f"a: {TOLD}" in notes
     assert re.search(cause, notes)
-    assert ("below half of the normal load, few and no small increments are tried" in notes) == (most < MOST_STEPS)
+    assert ("below half of the normal load, the search is cut short" in notes) == (most < MOST_STEPS)
     assert counted.steps < most
     assert counted.seconds < MINUTE
 
@@ -84,6 +85,14 @@ def test_what_no_tissue_can_is_refused_before_the_first_step(
     with pytest.raises(InputError, match=cause):
         counted.of(laws, load)
     assert not counted.steps
+
+
+def test_a_plate_that_rotates_may_go_on_with_a_doubted_material() -> None:
+    """To .84 of the load; with the few iterations that a parallel plate gets, to .65."""
+    laws, plate = {"skin": SKIN, "fat": NeoHooke.of(3e-5)}, Plate(DOWN, ALONG, turns=True)
+    done = simulate(dome(), laws, plate, [LoadStep("a", 0.5)])
+    assert "softer than in any published set" in " ".join(done.notes)
+    assert done.states[0].reached > 0.75
 
 
 def test_a_doubted_material_that_can_reach_its_load_does(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.interface_spline import Interfaces, InterfaceSpline
 from dvc.deformation.protocol import RigidMotion
 from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.measurement.judgement import alignment_of
 from dvc.registration.align import not_aligned
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonAtBone, GaussNewtonWithInterfaces
@@ -22,12 +23,18 @@ SHAPE, SPACING = (60, 48, 54), np.array([1.0, 1.2, 0.9])
 OBLIQUE = Rotation.from_rotvec([9.0, -14.0, 20.0], degrees=True).as_matrix()
 
 
-def registered(direction: np.ndarray, settings: Settings) -> tuple[Registration, np.ndarray]:
-    """A pair whose engine takes a bone that is a voxel smaller than the mask; and that bone as it was meant."""
+def registered(
+    direction: np.ndarray, settings: Settings, *, smaller_mm: float = 1.0, tissue_from: int = 0
+) -> tuple[Registration, np.ndarray]:
+    """A pair whose engine takes a bone that is a voxel smaller than the mask; and that bone as it was meant.
+
+    The tissue begins at an index along the first axis, and may leave out a part of the bone.
+    """
     grid = Grid(SHAPE, SPACING, (30.0, -20.0, 50.0), direction)
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
     away = np.linalg.norm((index - [12, 10, 13]) * SPACING / [1.0, 1.0, 0.8], axis=-1)  # in a corner, and no ball
-    body, bone, meant = (Mask(grid, away < r) for r in (7.0, 5.0, 4.0))
+    body, bone, meant = (Mask(grid, away < r) for r in (7.0, 5.0, 5.0 - smaller_mm))
+    body = Mask(grid, body.inside & (index[..., 0] >= tissue_from))
     image = Image(grid, np.where(body.inside, 1.0, 0.0).astype(np.float32))
     turn = Rotation.from_matrix(image.toward_lps().grid.direction).as_matrix()
 
@@ -55,6 +62,13 @@ def test_it_is_on_the_voxels_of_the_unloaded_image_as_it_is_stored(direction):
     assert found.bone_used is not None
     assert found.bone_used.grid is found.bone.grid
     assert np.array_equal(found.bone_used.inside, meant)
+
+
+def test_a_bone_that_leaves_the_tissue_has_no_surface_there():
+    found, _ = registered(np.eye(3), Settings(GaussNewtonAtBone()), smaller_mm=0.0, tissue_from=11)
+    assert np.count_nonzero(found.bone.inside & ~found.tissue.inside) > 50
+    assert np.array_equal(found.bone_used.inside, found.bone.inside & found.tissue.inside)
+    assert alignment_of(found)["bone_surface_moved_mm"] == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("engine", [GaussNewton(), GaussNewtonWithInterfaces()])

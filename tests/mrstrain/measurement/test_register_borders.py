@@ -138,7 +138,10 @@ def test_the_bone_mask_alone_lets_strain_jump_at_the_bone(pad, tmp_path):
     mean_mm, rms_mm = told["alignment"]["bone_surface_moved_mm"]
     assert -1.6 < mean_mm < -0.8
     assert rms_mm < 2.0
-    assert "Surface of the bone, moved to its dark rim: mean" in (tmp_path / "None" / "report.html").read_text()
+    assert (
+        "Distance of the bone surface used from that of the mask, mean"
+        in (tmp_path / "None" / "report.html").read_text()
+    )
     assert (folder / "figures" / "bone_used.pdf").is_file()
     smooth = tmp_path / "False" / "Load1"
     assert not [*smooth.glob("bone_used*"), *smooth.glob("figures/bone_used*")]

@@ -58,7 +58,8 @@ def interrupted(
             assert passed < OVER_S, "it is not over"
             after |= computed_s(family)
             time.sleep(0.05)
-        print(f"{command[0]}: told after {said_s:.1f} s, over after {time.monotonic() - began:.1f} s")
+        told_s = f"told after {said_s:.1f} s, " if by == signal.SIGINT else ""
+        print(f"{command[0]}: {told_s}over after {time.monotonic() - began:.1f} s")
         assert sum(after.values()) - sum(before.values()) < COMPUTED_S, "it went on"
         told = err.read_text()
         assert by != signal.SIGINT or "Stopping." in told, "it did not say so"

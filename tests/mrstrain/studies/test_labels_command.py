@@ -9,10 +9,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from dvc import Grid, LabelMap, read_image, read_labels, write_image, write_labels
@@ -20,6 +22,7 @@ from dvc.errors import InputError, MrstrainError
 from mrstrain.measurement.command import run_command
 from mrstrain.measurement.label_command import labelled_by_command
 from mrstrain.studies.check import check
+from mrstrain.studies.cluster import _kill
 from mrstrain.studies.file import read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.plan import plan
@@ -144,6 +147,53 @@ def test_a_command_ends_with_a_process_that_is_killed_at_its_first_instruction(t
         assert above.returncode == -signal.SIGKILL
         below = int((tmp_path / "below").read_text())
         wait_for(lambda: is_gone(below), limit_s=OVER_S)  # noqa: B023
+
+
+@pytest.fixture
+def running(tmp_path) -> Iterator[tuple[psutil.Process, int]]:
+    """The guard of a command that runs, and the command, below a process of their own."""
+    (tmp_path / "run.py").write_text(
+        "from mrstrain.measurement.command import run_command\n"
+        "print(run_command(['sh', '-c', 'echo $$ > below; trap \"\" TERM; sleep 1000 & wait'], '.', print))\n"
+    )
+    with subprocess.Popen([sys.executable, "run.py"], cwd=tmp_path, stderr=subprocess.PIPE, text=True) as above:
+        wait_for(lambda: (tmp_path / "below").is_file() and (tmp_path / "below").read_text().strip() != "", above)
+        (guard,) = psutil.Process(above.pid).children()
+        yield guard, int((tmp_path / "below").read_text())
+        above.kill()
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+def test_a_command_that_starts_while_the_processes_of_a_study_are_killed_ends(running):
+    """As they were listed before: the guard and what is above it, but not the command."""
+    guard, command = running
+    _kill([guard.parent(), guard])
+    wait_for(lambda: is_gone(command), limit_s=OVER_S)
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+def test_a_command_ends_with_its_guard(running):
+    guard, command = running
+    above = guard.parent()
+    guard.terminate()  # as a batch system does to every process
+    wait_for(lambda: is_gone(command), limit_s=OVER_S)
+    wait_for(lambda: is_gone(above.pid), limit_s=OVER_S)
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+def test_an_interrupt_returns_only_when_the_command_has_ended(running):
+    guard, command = running
+    above = guard.parent()
+    above.send_signal(signal.SIGINT)
+    wait_for(lambda: is_gone(above.pid) or is_gone(command), limit_s=OVER_S)
+    assert is_gone(command)
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+def test_a_guard_that_is_killed_is_not_taken_for_the_command(tmp_path):
+    said = "the process that watches over it was killed"
+    with pytest.raises(ChildProcessError, match=said):
+        run_command(["sh", "-c", "kill -9 $PPID"], tmp_path, lambda _: None)
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
