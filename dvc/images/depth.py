@@ -6,6 +6,7 @@ from scipy.special import ndtri
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.images.filters import gaussian
+from dvc.images.image import box_of
 
 _BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
 _SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
@@ -54,15 +55,13 @@ def moved_mm(before: BoolArray, after: BoolArray, spacing_mm: FloatArray) -> tup
 
     At the voxels on either side of the border; (0, 0) if the mask has none.
     """
-    some = np.argwhere(before | after)
-    if not len(some):
-        return 0.0, 0.0
-    low, high = np.maximum(some.min(axis=0) - _BESIDE, 0), some.max(axis=0) + _BESIDE + 1
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))  # of which the image may be several times as large
+    box = box_of(before | after, (_BESIDE,) * 3)  # of which the image may be several times as large
     before, after = before[box], after[box]
     border = binary_dilation(before) & ~binary_erosion(before, border_value=1)
+    if not border.any():
+        return 0.0, 0.0
     off = (depth_mm(after, spacing_mm) - depth_mm(before, spacing_mm))[border]
-    return (float(off.mean()), float(np.sqrt((off**2).mean()))) if off.size else (0.0, 0.0)
+    return float(off.mean()), float(np.sqrt((off**2).mean()))
 
 
 def to_surface_mm(body: BoolArray, spacing_mm: FloatArray) -> Float32Array:

