@@ -141,7 +141,7 @@ class Registration:
 
     @property
     def bone_used(self) -> Mask | None:
-        """The bone in the tissue, with its surface where the engine placed it; None if the engine does not place it."""
+        """Bone in the tissue, on the reference grid, up to the surface that the engine placed; None if it placed none."""
         used = self.displacement.bone if isinstance(self.displacement, InterfaceSpline) else None
         if used is None or self.bone is None or not self.settings.engine.needs_bone:
             return None
