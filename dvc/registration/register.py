@@ -141,7 +141,7 @@ class Registration:
 
     @property
     def bone_used(self) -> Mask | None:
-        """Bone in the tissue, on the reference grid, up to the surface that the engine placed; None if it placed none."""
+        """Bone in the tissue, on the reference grid, up to the surface that the engine placed; None without one."""
         used = self.displacement.bone if isinstance(self.displacement, InterfaceSpline) else None
         if used is None or self.bone is None or not self.settings.engine.needs_bone:
             return None
