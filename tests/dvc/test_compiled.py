@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
+import sys
 from pathlib import Path
 
 import numba.core.caching
@@ -54,6 +56,30 @@ def test_a_damaged_one_is_compiled_again(module, ending, left, damage):
     assert hits(module) == 2
     if ending == "nbc":
         assert {path: path.read_bytes() for path in others} == others
+
+
+def test_a_loop_is_compiled_again_if_a_function_that_it_calls_has_changed(tmp_path, monkeypatch):
+    """numba looks at the loop's own file alone, and ran the old function for ever."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "stored"))
+    monkeypatch.syspath_prepend(tmp_path)
+    deep = "from dvc.compiled import njit\n\n@njit(cache=True)\ndef deep(x):\n    return {}\n"
+    calls = "from dvc.compiled import njit\nfrom {0} import {0}\n\n@njit(cache=True)\ndef {1}(x):\n    return {0}(x)\n"
+    (tmp_path / "middle.py").write_text(calls.format("deep", "middle"))
+    (tmp_path / "outer.py").write_text(calls.format("middle", "outer"))
+
+    def told() -> tuple[int, int]:
+        for name in ("deep", "middle", "outer"):
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+        outer = importlib.import_module("outer").outer
+        return outer(3), sum(outer.stats.cache_hits.values())
+
+    (tmp_path / "deep.py").write_text(deep.format("x + 1"))
+    assert told() == (4, 0)
+    assert told() == (4, 1)
+    (tmp_path / "deep.py").write_text(deep.format("x + 10"))
+    assert told() == (13, 0)
+    assert told() == (13, 1)
 
 
 def test_where_nothing_can_be_stored_it_is_compiled_for_each_run(module, monkeypatch):
