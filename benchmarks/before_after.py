@@ -3,11 +3,11 @@
     git worktree add ../before COMMIT
     python -m benchmarks.before_after --before ../before --sizes 64 128 256 --out benchmarks/results/before_after.json
 
-Heel phantom 1 under load, in n^3 voxels with noise of their own, with and without the label map, as a command of its
-own on all cores: each round runs the command of the tree before and of this one, in turn. Wall and processor time of
-all its processes, the peak of their memory (Linux only), the median over rounds of the ratios of time, the root mean
-square difference of the maximum shear strain in all voxels where both measure it, and its root mean square error
-against the phantom's truth by tissue.
+Heel phantom 1 under load, in n^3 voxels with noise of their own, with one smooth spline, with a bone mask alone and
+with the label map, as a command of its own on all cores: each round runs the command of the tree before and of this
+one, in turn. Wall and processor time of all its processes, the peak of their memory (Linux only), the median over
+rounds of the ratios of time, the root mean square difference of the maximum shear strain in all voxels where both
+measure it, and its root mean square error against the phantom's truth by tissue.
 """
 
 from __future__ import annotations
@@ -33,18 +33,15 @@ from mrstrain.records.provenance import versions
 from phantoms import HeelPair, errors_by_tissue, heel_pair
 
 HERE = Path(__file__).resolve().parents[1]
+KINDS = {
+    "one spline": ["--no-borders"], "bone alone": [], "labels": ["--labels", "tissues.nii.gz", "--names", "tissues.csv"]
+}  # fmt: skip
 
 
-def run(
-    tree: Path, folder: Path, labels: bool, out: Path, variables: Mapping[str, str] | None = None
-) -> dict[str, float]:
-    """One run of the command with a tree's code, and variables of the environment beside those here.
-
-    Without labels one smooth spline is fitted, in any tree.
-    """
+def run(tree: Path, folder: Path, kind: str, out: Path, variables: Mapping[str, str] | None = None) -> dict[str, float]:
+    """One run of the command with a tree's code, and variables of the environment beside those here."""
     command = [sys.executable, "-m", "mrstrain", "register", "Load0.nii.gz", "Load1.nii.gz"]
-    command += ["--bone", "bone.nii.gz", "--out", str(out)]
-    command += ["--labels", "tissues.nii.gz", "--names", "tissues.csv"] if labels else ["--no-borders"]
+    command += ["--bone", "bone.nii.gz", "--out", str(out), *KINDS[kind]]
     environment = os.environ | {"PYTHONPATH": str(tree)} | dict(variables or {})
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed copy holds the bytecode of its modules
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
@@ -64,7 +61,7 @@ def errors_of(pair: HeelPair, load: Path) -> dict[str, float]:
     return {row.tissue: round(float(row.shear_rmse), 4) for row in rows}
 
 
-def compared(before: Path, count: int, labels: bool, rounds: int, warms: int) -> dict[str, object]:
+def compared(before: Path, count: int, kind: str, rounds: int, warms: int) -> dict[str, object]:
     """Both trees on one pair, in turn; rounds before the others only warm their compiled loops."""
     trees = {"before": before, "after": HERE}
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
@@ -74,7 +71,7 @@ def compared(before: Path, count: int, labels: bool, rounds: int, warms: int) ->
         written(pair, count, folder)
         for number in range(-warms, rounds):
             for name, tree in trees.items():
-                one = run(tree, folder, labels, folder / name)
+                one = run(tree, folder, kind, folder / name)
                 if number >= 0:
                     runs[name].append(one)
         errors = {name: errors_of(pair, folder / name / "Load1") for name in trees}
@@ -85,7 +82,7 @@ def compared(before: Path, count: int, labels: bool, rounds: int, warms: int) ->
         for key in ("wall_s", "processor_s", "peak_gib")
     }
     return {
-        "voxels": count**3, "labels": labels, **runs, "before_over_after": ratios,
+        "voxels": count**3, "kind": kind, **runs, "before_over_after": ratios,
         "rms_error_of_max_shear": errors,
         "rms_difference_of_max_shear": float(np.sqrt(np.mean((shear[0][both] - shear[1][both]) ** 2.0))),
     }  # fmt: skip
@@ -95,14 +92,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", type=Path, required=True)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     done: list[dict[str, object]] = []
     for count in given.sizes:
-        for labels in (False, True):
+        for kind in given.kinds:
             warms = int(count == given.sizes[0])
-            done.append(compared(given.before.resolve(), count, labels, given.rounds, warms))
+            done.append(compared(given.before.resolve(), count, kind, given.rounds, warms))
             print(json.dumps(done[-1]), flush=True)
             given.out.write_text(json.dumps({"versions": versions(), "cores": os.cpu_count(), "runs": done}, indent=1))
 

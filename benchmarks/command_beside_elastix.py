@@ -4,10 +4,10 @@
     python -m benchmarks.command_beside_elastix --before ../before --out benchmarks/results/command_beside_elastix.json
 
 Images of 126 x 140 x 132 voxels as `mrstrain phantom` writes them, on all cores. In each round, in turn: the command of
-the tree before and of this one, without and with labels; elastix' fit alone (`four_mm.txt`: 250 iterations at each of
-four resolutions), on the images as they are, in the mask of the tissue, in a process that has loaded elastix and
-started from the known motion of the bone; and this tree's command without any compiled loop on disk. Wall and processor
-seconds, and the peak memory of the commands.
+the tree before and of this one, with one smooth spline, with a bone mask alone and with labels; elastix' fit alone
+(`four_mm.txt`: 250 iterations at each of four resolutions), on the images as they are, in the mask of the tissue, in a
+process that has loaded elastix and started from the known motion of the bone; and this tree's command without any
+compiled loop on disk. Wall and processor seconds, and the peak memory of the commands.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.before_after import run
+from benchmarks.before_after import KINDS, run
 from dvc import AlignedPair, Settings, tissue_mask, write_image, write_labels, write_mask
 from dvc.registration.elastix import run as elastix
 from dvc.worker import Worker
@@ -59,13 +59,12 @@ def measured(before: Path, rounds: int) -> dict[str, list[dict[str, float]]]:
         written(pair, folder)
         worker.run("loading elastix", elastix.self_test)
         for number in range(rounds + 1):  # the first stores the compiled loops of both trees
-            for labels in (False, True):
-                kind = "labels" if labels else "no labels"
+            for kind in KINDS:
                 taken = {
-                    f"before, {kind}": run(before, folder, labels, folder / "before"),
-                    f"after, {kind}": run(HERE, folder, labels, folder / "after"),
+                    f"before, {kind}": run(before, folder, kind, folder / "before"),
+                    f"after, {kind}": run(HERE, folder, kind, folder / "after"),
                     f"after, {kind}, nothing compiled": run(
-                        HERE, folder, labels, folder / "first", {"NUMBA_CACHE_DIR": str(folder / f"{number}-{kind}")}
+                        HERE, folder, kind, folder / "first", {"NUMBA_CACHE_DIR": str(folder / f"{number}-{kind}")}
                     ),
                 }
                 for name, told in taken.items():

@@ -4,7 +4,6 @@ numba reads what it has stored without a check. A file that a full disk or a cra
 compiles a loop again if its own file has changed, but not if that of a function that it calls has.
 """
 
-import os
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -30,7 +29,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return numba.njit(**options | {"cache": False})(function)
         if (stored := getattr(kernel._cache, "_cache_file", None)) is not None:
             stored.__class__ = _CheckedFile
-            stored.function = function
+            stored.kernel = kernel
         return kernel
 
     return compiled
@@ -44,13 +43,13 @@ def prepare() -> None:
 class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]  # numba carries no types
     """numba's files of one function, an index and the code for each kind of arguments, with checksums at their ends."""
 
-    function: Callable[..., Any]
+    kernel: Any
 
     @property
-    def _source_stamp(self) -> list[tuple[float, int]]:
-        """Time and size of all sources that the stored code was made from."""
-        found = (os.stat(file) for file in sorted({f.__code__.co_filename for f in _called(self.function, [])}))
-        return [(one.st_mtime, one.st_size) for one in found]
+    def _source_stamp(self) -> list[object]:
+        """The stamps, taken when each was imported, of all sources that the stored code was made from."""
+        stores = (getattr(one._cache, "_cache_file", None) for one in _called(self.kernel, []))
+        return [vars(store)["_source_stamp"] for store in stores if store is not None]
 
     def save(self, key: Any, data: Any) -> None:
         with suppress(OSError):  # a full disk
@@ -58,33 +57,39 @@ class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]  # numba carries n
 
     def _dump(self, content: Any) -> bytes:
         dumped: bytes = super()._dump(content)
-        return dumped + sha256(dumped).digest()
+        return dumped + sha256(dumped + self._salt).digest()
+
+    @property
+    def _salt(self) -> bytes:
+        """Makes a checksum one of these sources: a file of the same name may hold code from others."""
+        return repr(self._source_stamp).encode()
 
     def _load_index(self) -> dict[Any, Any]:
         head = pickle.dumps(self._version, protocol=-1)
-        return super()._load_index() if _whole(Path(self._index_path), head) else {}
+        return super()._load_index() if _whole(Path(self._index_path), self._salt, head) else {}
 
     def _load_data(self, name: str) -> Any:
-        if not _whole(place := Path(self._data_path(name))):
+        if not _whole(place := Path(self._data_path(name)), self._salt):
             raise OSError(f"{place} is damaged")  # by which numba knows that it has to compile
         return super()._load_data(name)
 
 
-def _called(function: Callable[..., Any], seen: list[Callable[..., Any]]) -> Iterator[Callable[..., Any]]:
-    """A function, and those compiled ones that it calls, and that they call."""
-    seen.append(function)
-    yield function
+def _called(kernel: Any, seen: list[Any]) -> Iterator[Any]:
+    """A compiled function, those that it calls by a global name, and those that they call."""
+    seen.append(kernel)
+    yield kernel
+    function = kernel.py_func
     for name in function.__code__.co_names:
         used = function.__globals__.get(name)
-        if isinstance(used, Dispatcher) and used.py_func not in seen:
-            yield from _called(used.py_func, seen)
+        if isinstance(used, Dispatcher) and used not in seen:
+            yield from _called(used, seen)
 
 
-def _whole(path: Path, head: bytes = b"") -> bool:
-    """Whether a file begins with a head, and the rest ends with its checksum."""
+def _whole(path: Path, salt: bytes, head: bytes = b"") -> bool:
+    """Whether a file begins with a head, and the rest ends with the checksum of it and the salt."""
     try:
         content = path.read_bytes()
     except OSError:
         return False
     dumped = content[len(head) : -_DIGEST]
-    return content.startswith(head) and content[-_DIGEST:] == sha256(dumped).digest()
+    return content.startswith(head) and content[-_DIGEST:] == sha256(dumped + salt).digest()

@@ -148,11 +148,13 @@ def test_fe_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("python/fe.md", tmp_path, monkeypatch)
 
 
+@pytest.mark.full_size
 @pytest.mark.usefixtures("in_this_process")
 def test_phantoms_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("python/phantoms.md", tmp_path, monkeypatch)
 
 
+@pytest.mark.full_size
 @pytest.mark.usefixtures("in_this_process")
 def test_validate_in_python(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mesh_labels_once: Callable[..., object]

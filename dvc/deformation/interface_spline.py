@@ -70,8 +70,10 @@ class Interfaces:
                 gap_mm, nearest = distance_transform_edt(values <= 0, sampling=spacing, return_indices=True)
                 filled = np.where(unknown & (gap_mm <= _GAP_MM), values[tuple(nearest)], filled)
             values = filled
-        nearest = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
-        tissues, own = np.unique(values[tuple(nearest)], return_inverse=True)
+        if not values.all():
+            to = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
+            values = values[tuple(to)]
+        tissues, own = np.unique(values, return_inverse=True)
         rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
         return cls.between(labels.grid, frozen(own.reshape(values.shape), np.int64), rest, float(reach_mm))
 
@@ -82,8 +84,12 @@ class Interfaces:
         def coefficients(number: int) -> FloatArray:
             return np.asarray(spline_coefficients(depth_mm(own == number, grid.spacing_mm), np.float64))
 
+        count = int(own.max()) + 1
         with ThreadPoolExecutor(threads.count()) as pool:
-            depth = np.stack(list(pool.map(coefficients, range(int(own.max()) + 1))))
+            found = list(pool.map(coefficients, range(1 if count == 2 else count)))
+        if count == 2:  # one ends where the other begins
+            found.append(-found[0])
+        depth = np.stack(found)
         return cls(grid, frozen(depth, np.float64), own, rest, reach_mm)
 
     def turned(self, rotation: FloatArray) -> Self:

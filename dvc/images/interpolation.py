@@ -43,26 +43,37 @@ def indices_around(below: float, count: int) -> Four:
 
 
 @njit(cache=True)
+def _single(weights: Weights) -> Weights:
+    """The weights in single precision."""
+    a, b, c, d = weights
+    return np.float32(a), np.float32(b), np.float32(c), np.float32(d)  # type: ignore[return-value]
+
+
+@njit(cache=True)
 def cubic_at(image: Float32Array, x: float, y: float, z: float) -> float:
-    """The cubic spline of coefficients (ni, nj, nk) at a continuous index."""
+    """The cubic spline of coefficients (ni, nj, nk) at a finite index, from sums in single precision."""
     i, j, k = np.floor(x), np.floor(y), np.floor(z)
-    a, _ = spline_basis(x - i)
-    b, _ = spline_basis(y - j)
-    c, _ = spline_basis(z - k)
-    rows, columns, at = indices_around(i, image.shape[0]), indices_around(j, image.shape[1]), int(k)
-    beside = indices_around(k, image.shape[2])
-    total = 0.0
-    for p in range(4):
-        plane = 0.0
-        for q in range(4):
-            row = image[rows[p], columns[q]]
-            if 1 <= at < image.shape[2] - 2:
-                line = c[0] * row[at - 1] + c[1] * row[at] + c[2] * row[at + 1] + c[3] * row[at + 2]
-            else:
+    a, b, c = _single(spline_basis(x - i)[0]), _single(spline_basis(y - j)[0]), _single(spline_basis(z - k)[0])
+    (ni, nj, nk), (first_i, first_j, first_k) = image.shape, (int(i) - 1, int(j) - 1, int(k) - 1)
+    total = np.float32(0.0)
+    if min(first_i, first_j, first_k) < 0 or first_i + 4 > ni or first_j + 4 > nj or first_k + 4 > nk:
+        rows, columns, beside = indices_around(i, ni), indices_around(j, nj), indices_around(k, nk)
+        for p in range(4):
+            for q in range(4):
+                row = image[rows[p], columns[q]]
                 line = c[0] * row[beside[0]] + c[1] * row[beside[1]] + c[2] * row[beside[2]] + c[3] * row[beside[3]]
-            plane += b[q] * line
-        total += a[p] * plane
-    return total
+                total += a[p] * b[q] * line
+        return np.float64(total)
+    sums = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    around = image[first_i : first_i + 4, first_j : first_j + 4, first_k : first_k + 4]
+    for p in range(4):  # written out, so that the compiler takes the four of a row at once
+        near, w = around[p], a[p]
+        s = b[0] * near[0, 0] + b[1] * near[1, 0] + b[2] * near[2, 0] + b[3] * near[3, 0]
+        t = b[0] * near[0, 1] + b[1] * near[1, 1] + b[2] * near[2, 1] + b[3] * near[3, 1]
+        u = b[0] * near[0, 2] + b[1] * near[1, 2] + b[2] * near[2, 2] + b[3] * near[3, 2]
+        v = b[0] * near[0, 3] + b[1] * near[1, 3] + b[2] * near[2, 3] + b[3] * near[3, 3]
+        sums = sums[0] + w * s, sums[1] + w * t, sums[2] + w * u, sums[3] + w * v
+    return np.float64(c[0] * sums[0] + c[1] * sums[1] + c[2] * sums[2] + c[3] * sums[3])
 
 
 @njit(cache=True)

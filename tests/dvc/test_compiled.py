@@ -6,7 +6,9 @@ import importlib
 import importlib.util
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba.core.caching
 import pytest
@@ -58,28 +60,53 @@ def test_a_damaged_one_is_compiled_again(module, ending, left, damage):
         assert {path: path.read_bytes() for path in others} == others
 
 
-def test_a_loop_is_compiled_again_if_a_function_that_it_calls_has_changed(tmp_path, monkeypatch):
-    """numba looks at the loop's own file alone, and ran the old function for ever."""
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
+    """Three files whose functions call one another; imports the outermost as another process would."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "stored"))
     monkeypatch.syspath_prepend(tmp_path)
-    deep = "from dvc.compiled import njit\n\n@njit(cache=True)\ndef deep(x):\n    return {}\n"
-    calls = "from dvc.compiled import njit\nfrom {0} import {0}\n\n@njit(cache=True)\ndef {1}(x):\n    return {0}(x)\n"
-    (tmp_path / "middle.py").write_text(calls.format("deep", "middle"))
-    (tmp_path / "outer.py").write_text(calls.format("middle", "outer"))
+    source = "from dvc.compiled import njit\nfrom {0} import {0}\n\n@njit(cache=True)\ndef {1}(x):\n    return {0}(x)\n"
+    for name, used in (("middle", "deep"), ("outer", "middle")):
+        (tmp_path / f"{name}.py").write_text(source.format(used, name))
 
-    def told() -> tuple[int, int]:
+    def imported() -> Any:
         for name in ("deep", "middle", "outer"):
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
-        outer = importlib.import_module("outer").outer
-        return outer(3), sum(outer.stats.cache_hits.values())
+        return importlib.import_module("outer").outer
 
-    (tmp_path / "deep.py").write_text(deep.format("x + 1"))
-    assert told() == (4, 0)
-    assert told() == (4, 1)
-    (tmp_path / "deep.py").write_text(deep.format("x + 10"))
-    assert told() == (13, 0)
-    assert told() == (13, 1)
+    return imported
+
+
+def deep(folder: Path, body: str) -> None:
+    (folder / "deep.py").write_text(
+        f"from dvc.compiled import njit\n\n@njit(cache=True)\ndef deep(x):\n    return {body}\n"
+    )
+
+
+def told(outer: Any) -> tuple[int, int]:
+    """The result for 3, and whether stored code gave it."""
+    return outer(3), sum(outer.stats.cache_hits.values())
+
+
+def test_a_loop_is_compiled_again_if_a_function_that_it_calls_has_changed(calls, tmp_path):
+    """numba looks at the loop's own file alone, and ran the old function for ever."""
+    deep(tmp_path, "x + 1")
+    assert told(calls()) == (4, 0)
+    assert told(calls()) == (4, 1)
+    deep(tmp_path, "x + 10")
+    assert told(calls()) == (13, 0)
+    assert told(calls()) == (13, 1)
+
+
+def test_a_file_that_changes_or_goes_after_its_import_is_the_one_that_was_imported(calls, tmp_path):
+    deep(tmp_path, "x + 1")
+    outer = calls()
+    deep(tmp_path, "x + 10")
+    assert told(outer) == (4, 0)
+    assert told(outer := calls()) == (13, 0)
+    (tmp_path / "deep.py").unlink()
+    assert outer(2.5) == 12.5
 
 
 def test_where_nothing_can_be_stored_it_is_compiled_for_each_run(module, monkeypatch):

@@ -351,6 +351,7 @@ def test_a_gap_must_not_be_negative() -> None:
         Plate(DOWN, ALONG, gap_mm=-1.0)
 
 
+@pytest.mark.full_size
 def test_where_stiff_skin_buckles_over_soft_fat_the_way_goes_downhill(monkeypatch: pytest.MonkeyPatch) -> None:
     """A published pair of laws, skin a thousand times as stiff as fat; without the way down a third is reached."""
     soft = {"skin": NeoHooke.of(0.3247, nu=0.495), "fat": NeoHooke.of(0.00029, nu=0.495)}

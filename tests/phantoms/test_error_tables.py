@@ -263,6 +263,7 @@ def test_coverage_of_a_given_error_model() -> None:
     assert noisier.voxels_within < 0.6
 
 
+@pytest.mark.full_size
 def test_a_voxels_expanded_uncertainty_covers_the_truth_about_the_value_less_its_bias() -> None:
     """A strain measured .04 too small, in a run that the error model has not seen: not about the measured value."""
     seen = [samples(replace(CASE, seed=s), bias=-0.04, sd=0.02, count=20_000) for s in (1, 2, 3)]

@@ -147,6 +147,7 @@ def test_a_rotation_is_no_part_of_the_strain_that_is_recovered(pair: StarPair) -
         assert row.strain == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.full_size
 def test_two_scans_without_motion_are_registered_to_within_a_tenth_of_a_voxel() -> None:
     """Their receive fields differ. In tissue that fills the image, muscle was carried out of it by millimetres."""
     pair = star_pair(shape=(100, 40, 40), spacing_mm=1.2)

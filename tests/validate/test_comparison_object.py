@@ -48,6 +48,7 @@ def folder(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> 
     return place
 
 
+@pytest.mark.full_size
 @pytest.mark.usefixtures("real_pictures")  # as in processes of their own
 def test_loads_compared_in_processes_give_the_same_to_the_bit(comparison: Comparison, folder: Path, tmp_path) -> None:
     with side_by_side("comparing", 2) as each:

@@ -11,6 +11,7 @@ from dvc.compiled import njit
 from dvc.deformation.interface_spline import Interfaces
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image
+from dvc.registration.gauss_newton.coarser_grids import on_diagonal
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal
 from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, dot
@@ -22,10 +23,11 @@ _BLOCKS = 2.5  # blocks between two control points, about
 _LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
 _HALVINGS = 4
 _SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
-_SOLVER = 0.01, 20  # of the conjugate gradients: reduction of the residual, most iterations
-_SOLVER_OF_HALF = 0.01, 40  # half of the voxels are fitted in one step, to choose a weight, however large that is
+# Of conjugate gradients: reduction of the residual, most iterations. Half of the voxels are fitted in one step, to
+# choose a weight, however large that is. Two splines begin near where they end, and their blocks know of each other.
+_SOLVER, _SOLVER_OF_HALF = (0.01, 20), (0.01, 40)
+_SOLVER_OF_TWO, _SOLVER_OF_TWO_OF_HALF = (0.1, 20), (0.05, 40)
 _SMALLEST = 1e-6
-_ON_DIAGONAL = [0, 3, 5]  # xx, yy, zz
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
 _FLATTEST = 0.1  # det F below this is taken as this in F^-T
 _DIVERGED = "Check both images and the masks, or start from the result of a smaller load (chain)."
@@ -82,6 +84,9 @@ class Level:
         rim_mm: float = 0.0, interfaces: Interfaces | None = None, rest: FloatArray | None = None,
     ) -> None:  # fmt: skip
         self.rest = rest
+        two = interfaces is not None
+        self._solver = _SOLVER_OF_TWO if two else _SOLVER
+        self._solver_of_half = _SOLVER_OF_TWO_OF_HALF if two else _SOLVER_OF_HALF
         grid, control = images[0].grid, roughness.control
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / grid.spacing_mm), 1).astype(np.int64)
         self.control, self.roughness = control, roughness
@@ -157,8 +162,7 @@ class Level:
         of_images, of_prior = state.own_blocks, self._prior_blocks(weights)
         diagonals = [own / variance + held for own, held in zip(of_images, of_prior, strict=True)]
         for own in diagonals:
-            for block in own.reshape(-1, 6, *own.shape[1:]):
-                block[_ON_DIAGONAL] += _SMALLEST * block[_ON_DIAGONAL].max(axis=(1, 2, 3), keepdims=True)
+            own[on_diagonal(own)] += _SMALLEST * own[on_diagonal(own)].max(axis=(1, 2, 3), keepdims=True)
         return conjugate_gradients(product, force, by_blocks(diagonals), *solver)
 
     def _prior_blocks(self, weights: Weights) -> list[FloatArray]:
@@ -169,8 +173,8 @@ class Level:
         if weights.volume_gradient:
             blocks = [b + weights.volume_gradient * own for b, own in zip(blocks, self._of_gradient, strict=True)]
         for grid, block in enumerate(blocks):
-            for spline, rough in enumerate(self.roughness.diagonals(grid)):
-                block[6 * spline : 6 * spline + 6][_ON_DIAGONAL] += weights.bending * rough
+            for rough, on in zip(self.roughness.diagonals(grid), on_diagonal(block).reshape(-1, 3), strict=True):
+                block[on] += weights.bending * rough
         return blocks
 
     # What does not change from step to step: blocks on each grid for weights of 1.
@@ -204,7 +208,7 @@ class Level:
             return 0.5 * count * at.variance / variance + self.prior(at, weights)
 
         before = energy(state)
-        step = self.step(state, weights, variance, _SOLVER if state.halves < 0 else _SOLVER_OF_HALF)
+        step = self.step(state, weights, variance, self._solver if state.halves < 0 else self._solver_of_half)
         if not np.isfinite(step).all():
             raise RegistrationError(f"The registration diverged: a step is not finite. {_DIVERGED}")
         moved = self.pair.blocks.evaluate(step)[0]

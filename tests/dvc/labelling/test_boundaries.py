@@ -27,7 +27,7 @@ def off_mm(found: LabelMap, truth: LabelMap, name: str) -> tuple[float, float]:
     return float(off.mean()), float(np.sqrt((off**2).mean()))
 
 
-@pytest.mark.parametrize("by", [-1, 0, 1])
+@pytest.mark.parametrize("by", [-1, pytest.param(0, marks=pytest.mark.full_size), 1])
 def test_borders_come_out_alike_wherever_they_were_drawn(heel: tuple[Image, LabelMap], by: int) -> None:
     image, truth = heel
     given = misdrawn(truth, by)

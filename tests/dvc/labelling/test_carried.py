@@ -106,6 +106,7 @@ def test_a_tissue_of_its_own_name_belongs_to_fat_or_muscle_by_its_brightness() -
         assert _groups(TissueLabels(found, np.zeros((4, *grid.shape))), other, labels, "bone") == wanted
 
 
+@pytest.mark.full_size
 def test_labels_of_another_heel_find_their_places(heels: tuple[Image, LabelMap, Image, LabelMap]) -> None:
     image, truth, other, labels = heels
     told: list[float] = []

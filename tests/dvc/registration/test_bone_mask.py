@@ -73,7 +73,7 @@ def test_a_mask_is_judged_alike_at_any_voxels(heel_at, axes, moved_mm, told):
     assert (f"mirrored along the {told} voxel axis" in doubt) if told else (doubt == "")
 
 
-@pytest.mark.parametrize("shift_mm", [(3.0, 2.0, 1.0), (12.0, 8.0, 10.0)])
+@pytest.mark.parametrize("shift_mm", [(3.0, 2.0, 1.0), pytest.param((12.0, 8.0, 10.0), marks=pytest.mark.full_size)])
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_mask_in_the_other_frame_is_told_wherever_the_image_lies(shift_mm, turned):
     """RAS read as LPS turns a mask about the scanner's origin, which is in the middle of hardly any image."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Registration, Settings, register
 from phantoms import heel_pair
 
+slow = partial(pytest.param, marks=pytest.mark.full_size)
 COARSE_MM = 0.1  # at voxels of 1.6 mm; the full size, 0.8 mm, is held to 0.05 mm and 0.05 degrees below
 QUICK = {
     "MaximumNumberOfIterations": ("100",),
@@ -80,6 +82,7 @@ def test_the_total_motion_holds_the_bones_motion_as_well(found, small_pair):
     np.testing.assert_allclose(whole, apart, atol=1e-9)
 
 
+@pytest.mark.full_size
 def test_same_seed_same_result_bit_for_bit_other_seed_another(tiny_pair, worker):
     def registered(seed: int) -> Registration:
         settings = replace(few(), seed=seed, align_on="none")
@@ -106,6 +109,7 @@ def test_an_image_stored_in_another_orientation_gives_the_same_result(found, sma
     np.testing.assert_allclose(again.displacement.coefficients_mm, found.displacement.coefficients_mm, atol=1e-9)
 
 
+@pytest.mark.full_size
 def test_a_start_is_where_elastix_begins(found, small_pair, worker):
     """In one iteration at each resolution nothing is found; what is there was there at the start."""
     few = quick(MaximumNumberOfIterations=("1",))
@@ -168,8 +172,8 @@ def aligned(reference: Image, loaded: Image, bone: Mask) -> Alignment:
     return align(without_bias_field(reference), without_bias_field(loaded), bone, "bone", 1)
 
 
-@pytest.mark.parametrize("noise", [0.0, 3.0])
-@pytest.mark.parametrize("along", [[0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, -2.0, 1.0]], ids=str)
+@pytest.mark.parametrize("noise", [slow(0.0), 3.0])
+@pytest.mark.parametrize("along", [[0.0, 0.0, 1.0], [1.0, 1.0, 0.0], slow([1.0, -2.0, 1.0])], ids=str)
 def test_row_9_a_bone_along_which_fits_slide_is_not_located(along, noise):
     """A rod of uniform signal looks the same all along: fits begun apart stay apart, but for one with a knob."""
     random, axis = np.random.default_rng(3), np.array(along) / np.linalg.norm(along)
@@ -288,6 +292,7 @@ def test_elastix_own_reason_is_told(tiny_pair, worker):
         )
 
 
+@pytest.mark.full_size
 def test_missing_voxels_are_left_out(tiny_pair, worker):
     """A tenth of the bone is not shown: neither an edge for the rigid fit, nor a result there."""
     grid, inside = tiny_pair.loaded.grid, tiny_pair.bone.points()
@@ -352,6 +357,7 @@ def test_the_motion_of_a_bone_is_taken_from_any_deformation(small_pair):
     assert rms_over(small_pair.bone, found, motion) < 1e-9
 
 
+@pytest.mark.full_size
 def test_control_points_are_never_closer_than_two_voxels(small_pair, worker, caplog):
     """Thick slices: a spacing that the image cannot carry is widened, and that is told."""
     thick = Grid((64, 72, 14), np.array([1.6, 1.6, 8.0]), small_pair.reference.grid.origin_mm)

@@ -241,6 +241,7 @@ def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_pat
         assert (chosen.family, chosen.name) == ("elastix", name)
 
 
+@pytest.mark.full_size
 def test_the_twin_of_a_pair_is_measured_again_and_told(tiny_pair, tmp_path):
     write_image(tmp_path / "Load0.nii.gz", tiny_pair.reference)
     write_image(tmp_path / "Load1.nii.gz", tiny_pair.loaded)

@@ -185,6 +185,7 @@ def test_row_17_a_disk_too_small_for_all_loads_is_told_first(spy, scans, tmp_pat
     assert register(scans / "Load0.nii.gz", both[:1], **arguments).cases
 
 
+@pytest.mark.full_size
 def test_loads_at_once_are_those_one_after_the_other_bit_for_bit(scans, tmp_path):
     """A load and a repeat scan, a failing load beside; two workers and one, on equal threads."""
 

@@ -96,6 +96,7 @@ def test_only_what_another_mask_changes_is_done_anew(study, tiny_pair):
         write_mask(study / "calcaneus.nii.gz", tiny_pair.bone)
 
 
+@pytest.mark.full_size
 def test_a_series_makes_its_label_map_as_a_study_does(study, tmp_path, in_this_process):
     """With `register`, and what it refuses before anything is made."""
     load0, load1, bone = study / "Load0.nii.gz", study / "Load1.nii.gz", study / "calcaneus.nii.gz"

@@ -171,6 +171,7 @@ def test_a_stage_whose_worker_is_killed_is_tried_once_more_when_it_is_alone(tmp_
     )
 
 
+@pytest.mark.full_size
 def test_stages_that_waited_for_a_worker_that_is_killed_go_to_another(tmp_path):
     told = list[tuple[str, str, float]]()
     with cluster(lambda *event: told.append(event), [tmp_path], workers=2) as runner:

@@ -30,7 +30,7 @@ COMPUTED_S, SAID_S, OVER_S = 20.0, 15.0, 50.0
 and the times until it says so and until it is over, which they do. On a machine that has nothing else to do it is over
 in two seconds, unless a loop is compiled for the first time at that moment, which takes up to ten."""
 
-slow = partial(pytest.param, marks=pytest.mark.full_size)  # each command has one of process and group in `make test`
+slow = partial(pytest.param, marks=pytest.mark.full_size)  # `make test` has one of process and group for most commands
 
 
 def interrupted(
@@ -188,7 +188,7 @@ def running_a_cohort(images: Path, folder: Path) -> Case:
     ("case", "group"),
     [
         (simulating, False), slow(simulating, True), slow(meshing, False), (meshing, True),
-        (measuring_accuracy, False), slow(running_a_cohort, True),  # whose studies run as that of `run` above
+        slow(measuring_accuracy, False), slow(running_a_cohort, True),  # whose studies run as that of `run` above
     ],
 )  # fmt: skip
 def test_a_command_ends_and_keeps_what_is_finished(case, group, images, tmp_path):
@@ -264,7 +264,7 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize("function", ["run", "simulate"])
+@pytest.mark.parametrize("function", [slow("run"), "simulate"])
 def test_a_function_that_a_notebook_interrupts_raises_and_leaves_no_process(images, tmp_path, function):
     """The kernel goes on: it gets KeyboardInterrupt, and nothing computes beside it."""
     if function == "run":

@@ -311,6 +311,7 @@ def test_a_stage_whose_end_no_thread_can_tell_has_ended(tmp_path, monkeypatch):
     assert not runner.busy
 
 
+@pytest.mark.full_size
 def test_dask_keeps_no_record_of_stages_that_have_ended(tmp_path):
     """Of each it kept 24 KiB in this process and 7 KiB in the worker, for a thousand steps of each."""
     with cluster.cluster(lambda *_: None, [tmp_path], workers=1) as runner:

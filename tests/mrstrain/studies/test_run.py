@@ -235,6 +235,7 @@ def test_killed_in_any_stage_and_run_again_gives_the_same(done, tmp_path, stage)
     assert areas(study) == pytest.approx(areas(folder), rel=0.2 if stage == "mesh" else 1e-4)
 
 
+@pytest.mark.full_size
 def test_a_registration_whose_process_is_killed_is_tried_once_more(done, tmp_path):
     """As the system does where memory runs out; Load1 is killed again, fails alone and is named, Load2 is not."""
     folder, *_ = done

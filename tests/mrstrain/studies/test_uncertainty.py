@@ -106,6 +106,7 @@ def test_check_tells_the_further_solutions_and_a_tissue_that_is_not_there(varied
         (varied / "study.toml").write_text(text)
 
 
+@pytest.mark.full_size
 @pytest.mark.usefixtures("stages_in_this_process")
 def test_a_study_draws_its_inputs_and_says_what_each_adds(varied: Path) -> None:
     ran = run(varied, workers=1)
