@@ -92,6 +92,11 @@ class Interfaces:
         depth = np.stack(found)
         return cls(grid, frozen(depth, np.float64), own, rest, reach_mm)
 
+    @property
+    def of_bone_alone(self) -> bool:
+        """Whether the surface of a rigid bone is the only one."""
+        return self.rest >= 0 and len(self.depth) == 2
+
     def turned(self, rotation: FloatArray) -> Self:
         """The borders of a body that is turned about the world's origin."""
         return replace(self, grid=self.grid.moved_by(rotation, np.zeros(3)))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.sparse import csr_array
 
-from dvc.arrays import FloatArray, IntArray
+from dvc.arrays import FloatArray
 from dvc.compiled import njit
 from dvc.deformation.bspline import Table
 from dvc.threads import SMALL, in_parts
@@ -19,11 +19,6 @@ TWICE_AS_WIDE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 8.0
 """Coefficients of the cubic B-spline of twice the width: a sum of five."""
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Components of a symmetric 3 x 3 matrix, in the order of its six numbers: xx, xy, xz, yy, yz, zz."""
-
-
-def on_diagonal(blocks: FloatArray) -> IntArray:
-    """Where symmetric matrices (n, ...), the upper triangle row by row, have their diagonal among the n numbers."""
-    return np.cumsum([0, *range(int(np.sqrt(2 * len(blocks))), 1, -1)])
 
 
 def coarser(shape: Sequence[int]) -> tuple[int, int, int]:

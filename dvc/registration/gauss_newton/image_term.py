@@ -85,7 +85,8 @@ class ImagePair:
         else:
             self._first = tuple(slice(None, None, int(b)) for b in block)
             firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
-            self.blocks = SplineSums(control, firsts, compared, interfaces.at_voxels(compared, block))
+            shift = interfaces.reach_mm if interfaces.of_bone_alone else 0.0
+            self.blocks = SplineSums(control, firsts, compared, interfaces.at_voxels(compared, block), shift)
             self._factors = interfaces.at_voxels(self.inside, gradient=False)[..., 0]
         self._carried = np.zeros(self.grid.shape, dtype=np.float32)
 

@@ -11,10 +11,9 @@ from dvc.compiled import njit
 from dvc.deformation.interface_spline import Interfaces
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image
-from dvc.registration.gauss_newton.coarser_grids import on_diagonal
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal
 from dvc.registration.gauss_newton.roughness import Roughness
-from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, dot
+from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, dot, with_local_jump
 from dvc.registration.gauss_newton.spline_sums import SplineSums
 from dvc.registration.gauss_newton.sweeps import Stiffness
 from dvc.threads import in_parts
@@ -23,11 +22,11 @@ _BLOCKS = 2.5  # blocks between two control points, about
 _LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
 _HALVINGS = 4
 _SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
-# Of conjugate gradients: reduction of the residual, most iterations. Half of the voxels are fitted in one step, to
-# choose a weight, however large that is. Two splines begin near where they end, and their blocks know of each other.
-_SOLVER, _SOLVER_OF_HALF = (0.01, 20), (0.01, 40)
-_SOLVER_OF_TWO, _SOLVER_OF_TWO_OF_HALF = (0.1, 20), (0.05, 40)
+_SOLVER = 0.01, 20  # of the conjugate gradients: reduction of the residual, most iterations
+_SOLVER_OF_HALF = 0.01, 40  # half of the voxels are fitted in one step, to choose a weight, however large that is
+_SOLVER_AT_BONE, _SOLVER_AT_BONE_OF_HALF = (0.1, 20), (0.05, 40)  # where the surface of the bone is the only interface
 _SMALLEST = 1e-6
+_ON_DIAGONAL = [0, 3, 5]  # xx, yy, zz
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
 _FLATTEST = 0.1  # det F below this is taken as this in F^-T
 _DIVERGED = "Check both images and the masks, or start from the result of a smaller load (chain)."
@@ -84,13 +83,13 @@ class Level:
         rim_mm: float = 0.0, interfaces: Interfaces | None = None, rest: FloatArray | None = None,
     ) -> None:  # fmt: skip
         self.rest = rest
-        two = interfaces is not None
-        self._solver = _SOLVER_OF_TWO if two else _SOLVER
-        self._solver_of_half = _SOLVER_OF_TWO_OF_HALF if two else _SOLVER_OF_HALF
         grid, control = images[0].grid, roughness.control
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / grid.spacing_mm), 1).astype(np.int64)
         self.control, self.roughness = control, roughness
         self.pair = ImagePair(*images, inside, control, block, rim_mm, interfaces)
+        alone = bool(self.pair.blocks.shift)
+        self._solver = _SOLVER_AT_BONE if alone else _SOLVER
+        self._solver_of_half = _SOLVER_AT_BONE_OF_HALF if alone else _SOLVER_OF_HALF
         self._tissue = _share_at(control, soft | stiff, grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0
@@ -162,8 +161,12 @@ class Level:
         of_images, of_prior = state.own_blocks, self._prior_blocks(weights)
         diagonals = [own / variance + held for own, held in zip(of_images, of_prior, strict=True)]
         for own in diagonals:
-            own[on_diagonal(own)] += _SMALLEST * own[on_diagonal(own)].max(axis=(1, 2, 3), keepdims=True)
-        return conjugate_gradients(product, force, by_blocks(diagonals), *solver)
+            for block in own.reshape(-1, 6, *own.shape[1:]):
+                block[_ON_DIAGONAL] += _SMALLEST * block[_ON_DIAGONAL].max(axis=(1, 2, 3), keepdims=True)
+        preconditioned = by_blocks(diagonals)
+        if blocks.shift:
+            preconditioned = with_local_jump(preconditioned, blocks.shift)
+        return conjugate_gradients(product, force, preconditioned, *solver)
 
     def _prior_blocks(self, weights: Weights) -> list[FloatArray]:
         """The prior's part of the control points' own blocks, on each grid."""
@@ -173,8 +176,11 @@ class Level:
         if weights.volume_gradient:
             blocks = [b + weights.volume_gradient * own for b, own in zip(blocks, self._of_gradient, strict=True)]
         for grid, block in enumerate(blocks):
-            for rough, on in zip(self.roughness.diagonals(grid), on_diagonal(block).reshape(-1, 3), strict=True):
-                block[on] += weights.bending * rough
+            own = self.roughness.diagonals(grid)
+            if self.pair.blocks.shift:
+                own[1] += self.pair.blocks.shift**2 * own[0]
+            for spline, rough in enumerate(own):
+                block[6 * spline : 6 * spline + 6][_ON_DIAGONAL] += weights.bending * rough
         return blocks
 
     # What does not change from step to step: blocks on each grid for weights of 1.

@@ -1,9 +1,9 @@
 """Conjugate gradients for a Gauss-Newton step, preconditioned on control grids of several spacings.
 
-A control point's own block, of all its coefficients, tells a solver how far that point alone would go. It says nothing
-of waves over many of them, which then take hundreds of iterations. But cubic B-splines on a grid with points twice as
-far apart are among those of the finer grid: what their own blocks tell is added, grid by grid, each with less weight as
-they overlap (Bramble, Pasciak and Xu, Math. Comp. 1990, doi:10.1090/S0025-5718-1990-1023042-6).
+A control point's own 3 x 3 block tells a solver how far that point alone would go. It says nothing of waves over many
+of them, which then take hundreds of iterations. But cubic B-splines on a grid with points twice as far apart are among
+those of the finer grid: what their own blocks tell is added, grid by grid, each with less weight as they overlap
+(Bramble, Pasciak and Xu, Math. Comp. 1990, doi:10.1090/S0025-5718-1990-1023042-6).
 """
 
 from collections.abc import Callable, Sequence
@@ -11,11 +11,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.compiled import njit
 from dvc.registration.gauss_newton.coarser_grids import onto_coarser, onto_finer
-from dvc.threads import SMALL, in_parts
 
-_AT_ONCE = 512  # control points, whose numbers stay in the cache
 _SHARE = 0.4  # of what the coarser grid's blocks tell
 
 Preconditioner = Callable[[FloatArray], FloatArray]
@@ -50,13 +47,13 @@ def conjugate_gradients(
 def by_blocks(diagonals: Sequence[FloatArray]) -> Preconditioner:
     """The preconditioner from each grid's own blocks, finest first.
 
-    Blocks are symmetric matrices at each control point, positive definite: their upper triangles row by row,
-    (n, mi, mj, mk). It is symmetric and positive definite too.
+    Blocks are (6 splines, mi, mj, mk), symmetric 3 x 3 matrices xx, xy, xz, yy, yz, zz at each control point, positive
+    definite. It is symmetric and positive definite too.
     """
-    inverses = [_inverted(own) for own in diagonals]
+    inverses = [np.concatenate([_inverted(own) for own in np.split(d, len(d) // 6)]) for d in diagonals]
 
     def preconditioned(force: FloatArray, grid: int = 0) -> FloatArray:
-        out = _multiplied(inverses[grid], force)
+        out = _times(inverses[grid], force)
         if grid + 1 < len(inverses):
             longer = onto_finer(preconditioned(onto_coarser(force), grid + 1), force.shape[1:])
             longer *= _SHARE
@@ -66,73 +63,40 @@ def by_blocks(diagonals: Sequence[FloatArray]) -> Preconditioner:
     return preconditioned
 
 
+def with_local_jump(preconditioned: Preconditioner, reach_mm: float) -> Preconditioner:
+    """The preconditioner for the splines v and w of u = m v + psi w, from one for v + L w and w.
+
+    Beyond the reach L of an interface, psi is L m: v and w move tissue alike there, and the own blocks of one know
+    nothing of the other. Beside v + L w, the factor of w is psi - L m, which is zero there.
+    """
+
+    def local(force: FloatArray) -> FloatArray:
+        given = force.copy()
+        given[3:] -= reach_mm * force[:3]
+        out = preconditioned(given)
+        out[:3] -= reach_mm * out[3:]
+        return out
+
+    return local
+
+
+def _times(blocks: FloatArray, force: FloatArray) -> FloatArray:
+    out = np.empty_like(force)
+    for n in range(len(force) // 3):
+        xx, xy, xz, yy, yz, zz = blocks[6 * n : 6 * n + 6]
+        x, y, z = force[3 * n : 3 * n + 3]
+        out[3 * n] = xx * x + xy * y + xz * z
+        out[3 * n + 1] = xy * x + yy * y + yz * z
+        out[3 * n + 2] = xz * x + yz * y + zz * z
+    return out
+
+
 def _inverted(blocks: FloatArray) -> FloatArray:
-    """Inverses of symmetric positive matrices (n, mi, mj, mk)."""
-    out = np.empty(blocks.shape)
-    in_parts(_inverses, blocks[0].size, *_in_a_line(blocks, out))
-    return out
-
-
-def _multiplied(blocks: FloatArray, force: FloatArray) -> FloatArray:
-    """Products of symmetric matrices (n, mi, mj, mk) and vectors (m, mi, mj, mk) at each control point."""
-    out = np.empty(force.shape)
-    if out.size < SMALL:
-        _times(0, out[0].size, *_in_a_line(blocks, force, out))
-    else:
-        in_parts(_times, out[0].size, *_in_a_line(blocks, force, out))
-    return out
-
-
-def _in_a_line(*fields: FloatArray) -> list[FloatArray]:
-    """Fields (n, mi, mj, mk) as (n, control points); of those in C order, views."""
-    return [np.ascontiguousarray(field).reshape(len(field), -1) for field in fields]
-
-
-@njit(nogil=True, cache=True)
-def _times(start: int, stop: int, blocks: FloatArray, force: FloatArray, out: FloatArray) -> None:
-    """Of an upper triangle of n rows, row by row, entry (a, b) is number a n - a (a + 1) / 2 + b."""
-    size = len(force)
-    for first in range(start, stop, _AT_ONCE):
-        last = min(first + _AT_ONCE, stop)
-        for a in range(size):
-            onto = out[a, first:last]
-            onto[:] = 0.0
-            for b in range(size):
-                low, high = min(a, b), max(a, b)
-                block, along = blocks[low * size - low * (low + 1) // 2 + high, first:last], force[b, first:last]
-                for p in range(onto.size):
-                    onto[p] += block[p] * along[p]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")  # a matrix that has no inverse gets one of NaN
-def _inverses(start: int, stop: int, blocks: FloatArray, out: FloatArray) -> None:
-    """By a Cholesky factor R, upper triangular, and its inverse: A = R^T R."""
-    size = int(np.sqrt(2 * len(blocks)))
-    R, inverse = np.empty((size, size)), np.zeros((size, size))
-    for p in range(start, stop):
-        n = 0
-        for a in range(size):
-            for b in range(a, size):
-                rest = blocks[n, p]
-                for c in range(a):
-                    rest -= R[c, a] * R[c, b]
-                R[a, b] = np.sqrt(rest) if a == b else rest / R[a, a]
-                n += 1
-        for b in range(size):
-            inverse[b, b] = 1.0 / R[b, b]
-            for a in range(b - 1, -1, -1):
-                total = 0.0
-                for c in range(a + 1, b + 1):
-                    total += R[a, c] * inverse[c, b]
-                inverse[a, b] = -total / R[a, a]
-        n = 0
-        for a in range(size):
-            for b in range(a, size):
-                total = 0.0
-                for c in range(b, size):
-                    total += inverse[a, c] * inverse[b, c]
-                out[n, p] = total
-                n += 1
+    """Inverses of symmetric positive 3 x 3 matrices (6, ...)."""
+    xx, xy, xz, yy, yz, zz = blocks
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    found = np.stack([a, b, c, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy])
+    return np.asarray(found / (xx * a + xy * b + xz * c))
 
 
 def dot(a: FloatArray, b: FloatArray) -> float:

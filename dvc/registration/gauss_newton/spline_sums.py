@@ -6,7 +6,6 @@ fixed order, so that it is the same bit for bit on any number of threads.
 """
 
 from collections.abc import Sequence
-from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -28,13 +27,15 @@ class SplineSums:
     Displacement u and force f are in components along the grid's axes; gradients are per mm along them. A displacement
     may be a sum of splines, each times a factor that is known at the points, u = a_1 u_1 + a_2 u_2 + ...: coefficients
     are then those of all splines, (3 splines, mi, mj, mk), and `factors` (ni, nj, nk, splines, 4) are the value and the
-    gradient along the axes of each at the points. Without factors it is one spline.
+    gradient along the axes of each at the points. Without factors it is one spline. `own_blocks` are those of
+    u_1 + shift u_2 and u_2.
     """
 
     def __init__(
-        self, control: Grid, along: Sequence[FloatArray], inside: BoolArray, factors: FloatArray | None = None
-    ) -> None:
-        self.control = control
+        self, control: Grid, along: Sequence[FloatArray], inside: BoolArray, factors: FloatArray | None = None,
+        shift: float = 0.0,
+    ) -> None:  # fmt: skip
+        self.control, self.shift = control, shift
         self.inside = frozen(inside, np.bool_)
         # Of a line of points one after the other, so that the compiler takes several at once.
         self._factors = _ALONE if factors is None else np.ascontiguousarray(np.moveaxis(factors, 2, 4))
@@ -62,46 +63,32 @@ class SplineSums:
     def own_blocks(
         self, image: FloatArray | None = None, volume: FloatArray | None = None, shear: FloatArray | None = None
     ) -> list[FloatArray]:
-        """The points' part of the Hessian for each control point's own coefficients with one another.
+        """The points' part of the Hessian for each control point's three coefficients with one another.
 
-        A symmetric matrix of them all, x, y and z of the first spline, then of the next: its upper triangle row by row,
-        (6, mi, mj, mk) with one spline and (21, mi, mj, mk) with two. It is linear in the parts of `Stiffness` that are
-        given, with cofactors as those of no strain. So for each of the `GRIDS`, finest first; for a coarser one two
+        (6 splines, mi, mj, mk): xx, xy, xz, yy, yz, zz, spline by spline; it is linear in the parts of `Stiffness` that
+        are given, with cofactors as those of no strain. So for each of the `GRIDS`, finest first; for a coarser one two
         points of the last along each axis count as one in their middle.
         """
-        splines = self._factors.shape[2]
-        if not splines:
+        if not self._factors.shape[2]:
             return self._own_blocks(image, volume, shear)
-        rows = list(combinations_with_replacement([(s, m) for s in range(splines) for m in range(3)], 2))
-        grids: list[FloatArray] = []
-        for pair in combinations_with_replacement(range(splines), 2):
-            for grid, found in enumerate(self._of_pair(*pair, image, volume, shear)):
-                if grid == len(grids):
-                    grids.append(np.empty((len(rows), *found.shape[1:])))
-                for n, ((s, m), (t, a)) in enumerate(rows):
-                    if (s, t) == pair:
-                        grids[grid][n] = found[PAIRS.index((min(m, a), max(m, a)))]
-        return grids
-
-    def _of_pair(
-        self, s: int, t: int, image: FloatArray | None, volume: FloatArray | None, shear: FloatArray | None
-    ) -> list[FloatArray]:
-        """Blocks of two splines, seen through their factors, with one another; products of B and grad B are left out.
-
-        Those of the factors' gradients are kept for a spline with itself alone: of two splines they are not symmetric.
-        Without them the matrix of both stays positive.
-        """
-        factor, other = self._factors[:, :, s], self._factors[:, :, t]
-        both = factor[:, :, 0] * other[:, :, 0]
-        seen = None if image is None else image * both[..., None]
-        slope = np.moveaxis(factor[:, :, 1:], 2, 3)
-        if s == t and not (volume is None and shear is None) and slope.any():
-            seen = np.zeros((*both.shape, 6)) if seen is None else seen
-            whole, half = 0.0 if volume is None else volume, 0.0 if shear is None else 0.5 * shear
-            steep = np.einsum("...a,...a->...", slope, slope)
-            for entry, (m, n) in enumerate(PAIRS):
-                seen[..., entry] += (whole + half) * slope[..., m] * slope[..., n] + half * steep * (m == n)
-        return self._own_blocks(seen, *(None if each is None else each * both for each in (volume, shear)))
+        of_splines = []
+        # Each spline seen through its factor, products of B and grad B left out.
+        for spline in range(self._factors.shape[2]):
+            factor = self._factors[:, :, spline]
+            if spline and self.shift:
+                factor = factor - self.shift * self._factors[:, :, 0]
+            a, slope = factor[:, :, 0], np.moveaxis(factor[:, :, 1:], 2, 3)
+            square = a * a
+            seen = None if image is None else image * square[..., None]
+            if slope.any() and not (volume is None and shear is None):
+                seen = np.zeros((*a.shape, 6)) if seen is None else seen
+                whole, half = 0.0 if volume is None else volume, 0.0 if shear is None else 0.5 * shear
+                steep = np.einsum("...a,...a->...", slope, slope)
+                for entry, (m, n) in enumerate(PAIRS):
+                    seen[..., entry] += (whole + half) * slope[..., m] * slope[..., n] + half * steep * (m == n)
+            parts = (None if each is None else each * square for each in (volume, shear))
+            of_splines.append(self._own_blocks(seen, *parts))
+        return [np.concatenate(grid) for grid in zip(*of_splines, strict=True)]
 
     def _own_blocks(
         self, image: FloatArray | None, volume: FloatArray | None, shear: FloatArray | None

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvc import threads
 from dvc.deformation.bspline import BSpline
 from dvc.images.image import Grid
-from dvc.registration.gauss_newton.coarser_grids import coarser, on_diagonal, onto_coarser, onto_finer
+from dvc.registration.gauss_newton.coarser_grids import coarser, onto_coarser, onto_finer
 from dvc.registration.gauss_newton.roughness import Roughness
-from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients
+from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, with_local_jump
 from dvc.registration.gauss_newton.spline_sums import SplineSums
 from dvc.registration.gauss_newton.sweeps import Stiffness
 
@@ -75,123 +74,84 @@ def test_the_preconditioner_is_symmetric_and_positive():
     random = np.random.default_rng(3)
     shape = (10, 13, 12)
     grids = [shape, coarser(shape), coarser(coarser(shape))]
-    roots = [random.normal(size=(*grid, 6, 6)) for grid in grids]
-    full = [root @ np.swapaxes(root, -1, -2) + np.eye(6) for root in roots]
-    blocks = [np.stack([A[..., m, n] for m, n in zip(*np.triu_indices(6), strict=True)]) for A in full]
-    np.testing.assert_array_equal(np.moveaxis(blocks[0][on_diagonal(blocks[0])], 0, -1), full[0].diagonal(0, -2, -1))
+    roots = [random.normal(size=(*grid, 2, 3, 3)) for grid in grids]
+    full = [root @ np.swapaxes(root, -1, -2) + np.eye(3) for root in roots]
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    blocks = [np.stack([A[..., s, m, n] for s in range(2) for m, n in pairs]) for A in full]
     preconditioned = by_blocks(blocks)
     a, b = random.normal(size=(2, 6, *shape))
     assert np.sum(a * preconditioned(b)) == pytest.approx(np.sum(b * preconditioned(a)), rel=1e-10)
     assert np.sum(a * preconditioned(a)) > 0.0
-    alone = np.moveaxis(by_blocks(blocks[:1])(a), 0, -1)
-    np.testing.assert_allclose(np.einsum("...mn,...n", full[0], alone), np.moveaxis(a, 0, -1), atol=1e-9)
+    alone = by_blocks(blocks[:1])(a)
+    x = np.moveaxis(alone.reshape(2, 3, *shape), (0, 1), (-2, -1))
+    np.testing.assert_allclose(
+        np.einsum("...mn,...n", full[0], x), np.moveaxis(a.reshape(2, 3, *shape), (0, 1), (-2, -1))
+    )
 
 
-@pytest.fixture
-def own() -> list[np.ndarray]:
-    """Own blocks of two splines on each grid, positive definite."""
-    random, shape = np.random.default_rng(4), (12, 13, 14)
-    roots = [random.normal(size=(*grid, 6, 6)) for grid in (shape, coarser(shape), coarser(coarser(shape)))]
-    full = [root @ np.swapaxes(root, -1, -2) + np.eye(6) for root in roots]
-    return [np.stack([A[..., m, n] for m, n in zip(*np.triu_indices(6), strict=True)]) for A in full]
+SHIFT = 3.0
+CONTROL = Grid((9, 10, 11), np.array([3.0, 3.2, 2.9]), np.zeros(3))
+ALIKE = 0.8, 0.8 * SHIFT  # factors of two splines that move all points alike
 
 
-def test_any_number_of_threads_and_any_order_in_memory_give_the_same(own, monkeypatch):
-    monkeypatch.setattr("dvc.registration.gauss_newton.solver.SMALL", 0)
-    force = np.random.default_rng(5).normal(size=(6, *own[0].shape[1:]))
-    found = []
-    for count in (1, 3):
-        threads.use(count)
-        found.append(by_blocks(own)(force))
-    threads.use(1)
-    found.append(by_blocks([np.asfortranarray(one) for one in own])(np.asfortranarray(force)))
-    for other in found[1:]:
-        np.testing.assert_array_equal(other, found[0])
-    assert np.abs(found[0]).min() > 0.0
+def test_a_preconditioner_for_a_local_jump_is_one_for_both_splines():
+    """D acts on v + L w and w: exactly inverted there, it is inverted for v and w."""
+    random, shape = np.random.default_rng(4), (6, 7, 8)
+    root = random.normal(size=(*shape, 2, 3, 3))
+    D = root @ np.swapaxes(root, -1, -2) + np.eye(3)
+    blocks = np.stack([D[..., s, m, n] for s in range(2) for m, n in zip(*np.triu_indices(3), strict=True)])
+    v, w = force = random.normal(size=(2, 3, *shape))
+    found = with_local_jump(by_blocks([blocks]), SHIFT)(force.reshape(6, *shape))
+    x, y = np.moveaxis(found.reshape(2, 3, *shape), 1, -1)
+    by_sum, by_w = (np.einsum("...mn,...n", D[..., s, :, :], of) for s, of in enumerate((x + SHIFT * y, y)))
+    np.testing.assert_allclose(np.moveaxis(by_sum, -1, 0), v, atol=1e-10)
+    np.testing.assert_allclose(np.moveaxis(by_w + SHIFT * by_sum, -1, 0), w, atol=1e-10)
 
 
-def two_splines(factors: np.ndarray) -> tuple[SplineSums, Stiffness]:
-    """Two splines, with factors at each point, (2, 4) or (ni, nj, nk, 2, 4), and a stiffness that has all parts."""
-    random, shape = np.random.default_rng(6), tuple(a.size for a in ALONG)
-    root = random.normal(size=(*shape, 3, 3))
-    N = (root @ np.swapaxes(root, -1, -2)).reshape(*shape, 9)[..., [0, 1, 2, 4, 5, 8]]
-    sums = SplineSums(CONTROL, ALONG, random.uniform(size=shape) < 0.7, np.broadcast_to(factors, (*shape, 2, 4)).copy())
+def two_splines(shift: float) -> tuple[SplineSums, Stiffness]:
+    random = np.random.default_rng(6)
+    along = [np.arange(1.1, n - 2.0, 0.4) for n in CONTROL.shape]
+    shape = tuple(a.size for a in along)
+    factors = np.zeros((*shape, 2, 4))
+    factors[..., 0] = ALIKE
+    N = np.broadcast_to([3.0, 1.0, 0.5, 2.0, 0.2, 1.0], (*shape, 6)) * random.uniform(size=(*shape, 1))
     unstrained = np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy()
+    sums = SplineSums(CONTROL, along, random.uniform(size=shape) < 0.7, factors, shift)
     return sums, (N, unstrained, *random.uniform(size=(2, *shape)))
 
 
-CONTROL = Grid((9, 10, 11), np.array([3.0, 3.2, 2.9]), np.zeros(3))
-ALONG = [np.arange(1.1, n - 2.0, 0.4) for n in CONTROL.shape]
-ALIKE = np.array(
-    [[0.8, 0.0, 0.0, 0.0], [2.5, 0.0, 0.0, 0.0]]
-)  # the splines move all points alike, but for these factors
-AT = 4, 5, 3  # a control point
+@pytest.mark.parametrize("shift", [0.0, 0.4])
+def test_own_blocks_are_those_of_the_first_spline_and_a_share_of_the_second(shift):
+    sums, stiffness = two_splines(shift)
+    found = sums.own_blocks(stiffness[0], *stiffness[2:])[0][:, 4, 5, 3].reshape(2, 6)
+    for spline, mixed in enumerate(([1.0, 0.0], [-shift, 1.0])):
+        for m, row in enumerate(([0, 1, 2], [1, 3, 4], [2, 4, 5])):
+            one = np.zeros((2, 3, *CONTROL.shape))
+            one[:, m, 4, 5, 3] = mixed
+            pushed = sums.product(one.reshape(6, *CONTROL.shape), stiffness)[:, 4, 5, 3].reshape(2, 3)
+            np.testing.assert_allclose(found[spline, row], np.array(mixed) @ pushed, rtol=1e-10)
 
 
-def test_blocks_of_two_splines_that_do_the_same_are_those_of_the_product():
-    sums, stiffness = two_splines(ALIKE)
-    found = sums.own_blocks(stiffness[0], *stiffness[2:])[0][:, *AT]
-    for (m, n), entry in zip(zip(*np.triu_indices(6), strict=True), found, strict=True):
-        one = np.zeros((6, *CONTROL.shape))
-        one[m, *AT] = 1.0
-        assert sums.product(one, stiffness)[n, *AT] == pytest.approx(entry, rel=1e-10)
+def test_two_splines_that_do_the_same_are_solved_by_what_they_do_together():
+    """As away from the bone. Each spline's own blocks leave four times as much of the energy."""
+    rough = Roughness(CONTROL, ((1e-3, 1e-5), (3e-2, 2e-2)))
+    x = np.random.default_rng(8).normal(size=(6, *CONTROL.shape))
 
+    def left(shift: float) -> float:
+        sums, stiffness = two_splines(shift)
 
-def test_blocks_of_two_splines_with_factors_that_vary():
-    """Sums over all points of B B and grad B grad B, and of the factors' slopes for a spline with itself."""
-    factors = np.random.default_rng(7).normal(size=(*(a.size for a in ALONG), 2, 4))
-    sums, (N, _, volume, shear) = two_splines(factors)
-    axes = []  # values and slopes of the control point's B-spline along each axis
-    for (first, value, slope), at in zip(sums.table, AT, strict=True):
-        of = at - first
-        seen = (of >= 0) & (of < 4)
-        rows = np.arange(first.size), np.clip(of, 0, 3)
-        axes.append([np.where(seen, value[rows], 0.0), np.where(seen, slope[rows], 0.0)])
-    B = np.einsum("i,j,k->ijk", axes[0][0], axes[1][0], axes[2][0])
-    slopes = [np.einsum("i,j,k->ijk", *(axes[a][int(a == m)] for a in range(3))) for m in range(3)]
-    grad = np.stack(slopes, axis=-1)
-    image = np.empty((*B.shape, 3, 3))
-    for n, (m, a) in enumerate(zip(*np.triu_indices(3), strict=True)):
-        image[..., m, a] = image[..., a, m] = N[..., n]
+        def product(c: np.ndarray) -> np.ndarray:
+            return sums.product(c, stiffness) + rough.product(c)
 
-    def resisted(g: np.ndarray) -> np.ndarray:
-        """Of volume and shear, for displacements along each axis with gradient g."""
-        outer, square = g[..., :, None] * g[..., None, :], np.einsum("...a,...a", g, g)[..., None, None]
-        return (volume + 0.5 * shear)[..., None, None] * outer + 0.5 * shear[..., None, None] * square * np.eye(3)
-
-    exact = np.zeros((6, 6))
-    for s in range(2):
-        for t in range(2):
-            part = (factors[..., s, 0] * factors[..., t, 0])[..., None, None]
-            part = part * (image * (B**2)[..., None, None] + resisted(grad))
-            if s == t:
-                part = part + (B**2)[..., None, None] * resisted(factors[..., s, 1:])
-            exact[3 * s : 3 * s + 3, 3 * t : 3 * t + 3] = part[sums.inside].sum(axis=0)
-    found = sums.own_blocks(N, volume, shear)[0][:, *AT]
-    np.testing.assert_allclose(found, exact[np.triu_indices(6)], rtol=1e-9, atol=1e-9)
-
-
-def test_two_splines_that_do_nearly_the_same_are_solved_together():
-    """As away from interfaces. Blocks that know nothing of the other spline leave four times as much of the energy."""
-    sums, stiffness = two_splines(ALIKE)
-    rough = Roughness(sums.control, ((1e-3, 1e-5), (3e-2, 2e-2)))
-    blocks = sums.own_blocks(stiffness[0], *stiffness[2:])
-    for grid, own in enumerate(blocks):
-        for part, on in zip(rough.diagonals(grid), on_diagonal(own).reshape(-1, 3), strict=True):
-            own[on] += part
-    alone = [own.copy() for own in blocks]
-    for own in alone:
-        own[[n for n, (a, b) in enumerate(zip(*np.triu_indices(6), strict=True)) if a < 3 <= b]] = 0.0
-    x = np.random.default_rng(8).normal(size=(6, *sums.control.shape))
-
-    def product(c: np.ndarray) -> np.ndarray:
-        return sums.product(c, stiffness) + rough.product(c)
-
-    def left(diagonals: list[np.ndarray]) -> float:
-        off = conjugate_gradients(product, product(x), by_blocks(diagonals), 0.0, 20) - x
+        blocks = sums.own_blocks(stiffness[0], *stiffness[2:])
+        for grid, own in enumerate(blocks):
+            of_v, of_w = rough.diagonals(grid)
+            own[[0, 3, 5]] += of_v
+            own[[6, 9, 11]] += of_w + shift**2 * of_v
+        off = conjugate_gradients(product, product(x), with_local_jump(by_blocks(blocks), shift), 0.0, 20) - x
         return float(np.sum(off * product(off)))
 
-    assert left(blocks) < 0.5 * left(alone)
+    assert left(SHIFT) < 0.5 * left(0.0)
 
 
 def widened(shape: tuple[int, ...], grid: int) -> np.ndarray:
