@@ -87,6 +87,7 @@ def test_what_no_tissue_can_is_refused_before_the_first_step(
     assert not counted.steps
 
 
+@pytest.mark.full_size
 def test_a_plate_that_rotates_may_go_on_with_a_doubted_material() -> None:
     """To .84 of the load; with the few iterations that a parallel plate gets, to .65."""
     laws, plate = {"skin": SKIN, "fat": NeoHooke.of(3e-5)}, Plate(DOWN, ALONG, turns=True)
