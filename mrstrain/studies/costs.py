@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dvc import TetMesh, read_image, read_labels
+from dvc import LabelMap, TetMesh, read_image, read_labels, tissue_mask
 from dvc.errors import InputError
 from dvc.measurement.subject import bones_of
 from dvc.registration.engine import Cost
@@ -45,14 +45,15 @@ def sizes_of(study: Study) -> tuple[float, float]:
         reference, how = read_image(study.path(study.images.load0), allow_missing=True), study.mesh
         voxels = float(np.prod(reference.grid.shape))
         drawn = drawn_to_mesh(study)
-        if how.file is None and drawn is None:
-            return voxels, _USUAL_CELLS
         if not study.models.sets:
             return voxels, 0.0
         if how.file is not None:
             return voxels, float(len(mesh_given(study).cells))
-        assert drawn is not None
-        labels = read_labels(*drawn)
+        if drawn is None:  # a label map will be made: as of a body of one tissue
+            body = tissue_mask(reference).inside.astype(np.int64)
+            labels = LabelMap(reference.grid, body, {1: "tissue"})
+        else:
+            labels = read_labels(*drawn)
     except (InputError, OSError):
         return USUAL_VOXELS, _USUAL_CELLS
     return voxels, cells_of(labels, bones_of(labels, how.bones), how.edge_mm)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvc.images.image import Grid, LabelMap
-from dvc.io.images.write import write_labels
+from dvc.images.image import Grid, Image, LabelMap
+from dvc.io.images.write import write_image, write_labels
 from mrstrain.records.progress import duration
 from mrstrain.studies import costs
 from mrstrain.studies.file import read_study
@@ -125,3 +125,18 @@ def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
     levelled = replace(first, name="level trebbi Load1")
     (study / "study.toml").write_text(STUDY + '[loads.Load2]\nimage = "Load1.nii.gz"\n')
     assert costs.disk_bytes(levelled, read_study(study), 1e6) == costs.disk_bytes(levelled, told, 1e6)
+
+
+def test_a_label_map_that_will_be_made_has_the_cells_of_the_body(study):
+    values = np.ones((32,) * 3, dtype=np.float32)
+    values[8:24, 8:24, 8:24] = 100.0
+    write_image(study / "Load0.nii.gz", Image(Grid(values.shape, (2.0,) * 3, GRID.origin_mm), values))
+
+    def cells(edge_mm: float) -> float:
+        text = STUDY.replace("[mesh]", f"[mesh]\nedge_mm = {edge_mm}").replace('names = "tissues.csv"\n', "")
+        made = text.replace('labels = "tissues.nii.gz"', 'labels = "auto"\nbone_mask = "bone.nii.gz"')
+        (study / "study.toml").write_text(made)
+        return costs.sizes_of(read_study(study))[1]
+
+    assert 32.0**3 / 0.8 < cells(2.0) < 2.0 * 32.0**3 / 0.8  # the mask has a voxel more around it
+    assert cells(4.0) < 0.3 * cells(2.0)
