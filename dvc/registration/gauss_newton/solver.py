@@ -67,7 +67,8 @@ def with_local_jump(preconditioned: Preconditioner, reach_mm: float) -> Precondi
     """The preconditioner for the splines v and w of u = m v + psi w, from one for v + L w and w.
 
     Beyond the reach L of an interface, psi is L m: v and w move tissue alike there, and the own blocks of one know
-    nothing of the other. Beside v + L w, the factor of w is psi - L m, which is zero there.
+    nothing of the other. Beside v + L w, the factor of w is psi - L m, which is zero there. Coefficients are those of
+    v, mm, and then of w, (6, mi, mj, mk); L is in mm.
     """
 
     def local(force: FloatArray) -> FloatArray:

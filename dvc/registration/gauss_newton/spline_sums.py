@@ -28,7 +28,7 @@ class SplineSums:
     may be a sum of splines, each times a factor that is known at the points, u = a_1 u_1 + a_2 u_2 + ...: coefficients
     are then those of all splines, (3 splines, mi, mj, mk), and `factors` (ni, nj, nk, splines, 4) are the value and the
     gradient along the axes of each at the points. Without factors it is one spline. `own_blocks` are those of
-    u_1 + shift u_2 and u_2.
+    u_1 + shift u_2 and u_2, with the shift in mm.
     """
 
     def __init__(
