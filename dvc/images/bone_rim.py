@@ -1,6 +1,6 @@
 """The surface of a bone as an MR image shows it: the outer edge of its dark rim."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,6 +11,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.images.depth import depth_mm
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
+from dvc.images.tissue import within
 
 _REACH = 2.5  # voxels, of a surface that is moved
 _BLUR_MM = 0.4
@@ -26,6 +27,7 @@ _OF_DEEPEST = 0.5  # of the bone's greatest depth: the first mean is not of its 
 _THICKEST = 2.1  # over the thinnest voxel edge: in thicker slices, rims are not seen in all directions
 _LEAST, _LEAST_LOCAL = 0.2, 0.5  # voxels: smaller means are noise
 _CLEAR, _CLEAR_LOCAL = 1.0, 2.0  # reaches from where the dark goes on: nearer distances are left out of the means
+_ROUGH_MM, _ROUGH = 4.0, 0.25  # mm and voxels: a surface that is farther off in this neighbourhood goes to the rim
 _LEAST_SHARE = 0.1  # of the surface there that shows a rim: below, the distance tends to zero
 NUMBERS = {
     "reach": _REACH, "blur_mm": _BLUR_MM, "around_mm": _AROUND_MM, "dark_percent": _DARK_PERCENT, "edge": _EDGE,
@@ -41,7 +43,12 @@ def reach_of(spacing_mm: FloatArray) -> float:
     return _REACH * float(spacing_mm.mean())
 
 
-def bone_to_rim(image: Image, bone: Mask, body: Mask) -> tuple[Mask, float]:
+def is_thick(spacing_mm: FloatArray) -> bool:
+    """Whether slices are so thick that rims are not seen in all directions: no surface is moved then."""
+    return bool(spacing_mm.max() > _THICKEST * spacing_mm.min())
+
+
+def bone_to_rim(image: Image, bone: Mask, body: Mask, *, by_voxel: bool = False) -> tuple[Mask, float]:
     """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
 
     It comes with the share of the mask's surface at which this distance is known: .29 to .94 on phantom heels, about 0
@@ -50,49 +57,57 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask) -> tuple[Mask, float]:
     The distance is averaged on the surface in a neighbourhood of 6 mm (standard deviation; less in a thin bone), which
     corrects a mask that is too large or too small, and then once more in a neighbourhood of 1.25 voxels, which corrects
     what is off in patches. The surface moves only where a mean is at least .2 and .5 voxels: an exact mask stays, which
-    noise would change if each voxel went to the rim, as in `bones_to_rims`. Where the image shows no rim, and where the
-    dark goes on beyond it, as in tendon, the distance is that of the neighbourhood; it is zero where a rim is far. In
-    slices more than 2.1 times as thick as the other voxel edges, the surface stays. ``image`` has no bias field; the
-    bone and the ``body``, bone included, are on its grid.
+    noise would change if each voxel went to the rim. Where the image shows no rim, and where the dark goes on beyond
+    it, as in tendon, the distance is that of the neighbourhood; it is zero where a rim is far. In slices more than 2.1
+    times as thick as the other voxel edges, the surface stays. ``image`` has no bias field; the bone and the ``body``,
+    bone included, are on its grid. Beside what is not of the body, such as another bone, a rim is seen all the same.
+
+    With ``by_voxel``, the surface then lies at the rim itself, voxel by voxel, where it is still off by more than a
+    quarter of a voxel (root mean square in a neighbourhood of 4 mm), which an exact mask hardly is. Tendon must then be
+    left out of the body: a rim beside it goes on as in a thick cortex.
     """
     spacing = image.grid.spacing_mm
-    if spacing.max() > _THICKEST * spacing.min():
+    if is_thick(spacing):
         return bone, 0.0
     reach_mm, edge_mm = reach_of(spacing), float(spacing.mean())
     box = bone.box(int(np.ceil((reach_mm + _TRUNCATE * _AROUND_MM) / spacing.min())))
     part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
-    rims = _Rims.of(part.values, given, body.inside[box] & ~given, spacing, rims_have_gaps=True)
+    rims = _Rims.of(part.values, given, body.inside[box] & ~given, spacing)
     clear_mm = np.full(given.shape, np.inf)
     if rims.goes_on.any():
         clear_mm = distance_transform_edt(~rims.goes_on, sampling=spacing)
     depth, depth_of_rim = (depth_mm(of, spacing) for of in (given, np.where(rims.seen, rims.found, given)))
     mean_mm, shown = min(_MEAN_MM, _OF_DEEPEST * float(depth.max())), list[float]()
-    for around_mm, least, clear in ((mean_mm, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
+
+    def at_surface(clear: float) -> tuple[BoolArray, BoolArray]:
+        """Voxels at the surface, and those of them whose distance to the rim is known."""
         surface = rims.near & (np.abs(depth) < 0.55 * edge_mm)  # beside a plane: 0.52
-        known = surface & rims.seen & (clear_mm > clear * reach_mm)
+        return surface, surface & rims.seen & (clear_mm > clear * reach_mm)
+
+    for around_mm, least, clear in ((mean_mm, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
+        surface, known = at_surface(clear)
         shown.append(float(known[surface].mean()) if surface.any() else 0.0)
         off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
         depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)
+    if by_voxel:
+        squares = _mean_along(*at_surface(0.0), (depth_of_rim - depth) ** 2, _ROUGH_MM / spacing)
+        depth = np.where(rims.seen & (squares > (_ROUGH * edge_mm) ** 2), depth_of_rim, depth)
     found = bone.inside.copy()
     found[box] = np.where(rims.near & ~rims.core, depth > 0.0, given)
     return Mask(bone.grid, found), shown[0]
 
 
-def bones_to_rims(
-    values: Float32Array, given: BoolArray, soft: BoolArray, tissues: Sequence[BoolArray], spacing_mm: FloatArray
-) -> BoolArray:
-    """Bones (ni, nj, nk) whose surfaces lie within reach of those given, at the outer edge of their dark rims.
-
-    Where the image shows no such edge with the brighter ``soft`` tissue, and beside those of the ``tissues`` that are
-    as dark as a rim, such as tendon, surfaces stay. ``values`` are of an image without its bias field and without
-    missing voxels.
-    """
-    rims = _Rims.of(values, given, soft, spacing_mm, rims_have_gaps=False)
-    seen = rims.seen
-    for tissue in tissues:
-        if float(np.median(rims.blurred[tissue])) < _LEAST_STEP * rims.dark:
-            seen = seen & (distance_transform_edt(~tissue, sampling=spacing_mm) > 0.5 * reach_of(spacing_mm))
-    return np.where(seen, rims.found, given)
+def as_dark_as_rims(image: Image, bones: BoolArray, tissues: Iterable[BoolArray]) -> BoolArray:
+    """Voxels (ni, nj, nk) of those tissues that are as dark as the rims of bones, such as tendon."""
+    spacing = image.grid.spacing_mm
+    beside = within(bones, spacing, reach_of(spacing)) & within(~bones, spacing, reach_of(spacing))
+    dark = np.zeros_like(bones)
+    if beside.any():
+        blurred = gaussian_filter(image.values, _BLUR_MM / spacing)
+        most = _LEAST_STEP * float(np.percentile(blurred[beside], _DARK_PERCENT))
+        for tissue in tissues:
+            dark |= tissue & (float(np.median(blurred[tissue])) < most)
+    return dark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,10 +123,8 @@ class _Rims:
     dark: float  # brightness of the rims
 
     @classmethod
-    def of(
-        cls, values: Float32Array, given: BoolArray, soft: BoolArray, spacing_mm: FloatArray, *, rims_have_gaps: bool
-    ) -> Self:
-        """Rims of the bones given. If rims have gaps, a surface that is farther than the reach from one shows none.
+    def of(cls, values: Float32Array, given: BoolArray, soft: BoolArray, spacing_mm: FloatArray) -> Self:
+        """Rims of the bones given. A surface that is farther than the reach from one shows none.
 
         From inside the bones and from beyond their reach, regions grow until they meet in the darkest part of the rim.
         A bone gets the rest of the rim, up to the edge with the brighter soft tissue.
@@ -130,7 +143,7 @@ class _Rims:
         beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
         dark = float(np.percentile(blurred[near], _DARK_PERCENT))
         as_dark = near & (blurred < dark + _EDGE * (beside - dark))
-        known = distance_transform_edt(~as_dark, sampling=spacing_mm) <= reach_mm if rims_have_gaps else near
+        known = distance_transform_edt(~as_dark, sampling=spacing_mm) <= reach_mm
         thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
         rim = as_dark & (distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm)
         found = (inner | rim) & (soft | given)

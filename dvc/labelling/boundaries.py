@@ -12,7 +12,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
 from dvc.images.bone_names import is_bones_name
-from dvc.images.bone_rim import bones_to_rims, reach_of
+from dvc.images.bone_rim import as_dark_as_rims, bone_to_rim, is_thick, reach_of
 from dvc.images.depth import depth_mm, moved_mm
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
@@ -110,19 +110,23 @@ def correct_labels(
             at_border = (np.abs(depth_mm(whole & ~skin, spacing)) <= reach) & ~fixed
             new_skin = np.where(at_border & ~bones, found.probability > 0.5, skin) & body
     watch(0.6)
-    new_bones = bones
-    if bones.any():
-        tissues = [given == number for number in np.unique(given[body & ~bones])]
-        found_bones = bones_to_rims(even.values, bones, whole & ~new_skin, tissues, spacing)
-        new_bones = np.where(fixed, bones, found_bones) & body
-    new_skin &= ~new_bones
+    if bones.any() and is_thick(spacing):
+        notes.append("The bones are unchanged: slices are over 2.1 times as thick as the other voxel edges.")
+    new_bones = np.zeros_like(given)
+    tissues = (given == number for number in np.unique(given[body & ~bones]))
+    around = whole & ~bones & ~new_skin & ~as_dark_as_rims(even, bones, tissues)
+    for number in np.unique(given[bones]):
+        bone = given == number
+        found_bone = bone_to_rim(even, Mask(grid, bone), Mask(grid, bone | around), by_voxel=True)[0].inside
+        new_bones[np.where(fixed, bone, found_bone) & body] = number
+    new_skin &= new_bones == 0
     watch(0.9)
     others = body & ~bones & ~skin
-    corrected = np.where(new_bones, _nearest(given, bones), np.where(new_skin, _nearest(given, skin), 0))
-    corrected = np.where(body & ~new_bones & ~new_skin, _nearest(given, others), corrected)
+    corrected = np.where(new_bones > 0, new_bones, np.where(new_skin, _nearest(given, skin), 0))
+    corrected = np.where(body & (corrected == 0), _nearest(given, others), corrected)
     moved = {
         name: moved_mm(was, now, spacing)
-        for name, was, now in (("bone", bones, new_bones), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
+        for name, was, now in (("bone", bones, new_bones > 0), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
         if (was & body).any()
     }
     watch(1.0)

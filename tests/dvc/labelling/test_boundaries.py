@@ -70,6 +70,27 @@ def test_a_tissue_as_dark_as_a_rim_and_a_small_bone_stay() -> None:
     assert wrong[0] < 0.4 * wrong[1]
 
 
+def test_bones_of_an_exact_map_stay_and_those_off_in_patches_are_moved(heel: tuple[Image, LabelMap]) -> None:
+    """Voxel by voxel, noise moved exact bones by .16 mm; by means alone, those in patches stayed off by .39 mm."""
+    image, truth = heel
+    assert off_mm(correct_labels(image, truth).labels, truth, "bone")[1] < 0.08
+    cubes = [np.arange(n) * SPACING // 5.0 for n in truth.labels.shape]  # of 5 mm
+    drawn = np.random.default_rng(1).integers(-1, 2, [int(of[-1]) + 1 for of in cubes])
+    drawn = drawn[np.ix_(*(of.astype(int) for of in cubes))]
+    labels = np.select([drawn == by for by in (-1, 1)], [misdrawn(truth, by).labels for by in (-1, 1)], truth.labels)
+    made = correct_labels(image, LabelMap(truth.grid, labels, truth.names))
+    assert off_mm(made.labels, truth, "bone")[1] < 0.28
+
+
+def test_bones_in_thick_slices_stay_and_it_is_told() -> None:
+    image, truth, _ = balls()
+    grid = Grid((50, 50, 17), (1.0, 1.0, 3.0), (-24.5, -24.5, -24.5))
+    drawn = np.where(binary_dilation(truth.labels == 1), 1, truth.labels)[:, :, ::3]
+    made = correct_labels(Image(grid, image.values[:, :, ::3]), LabelMap(grid, drawn, NAMES))
+    assert np.array_equal(made.labels.labels, drawn)
+    assert any("slices are over 2.1 times as thick" in note for note in made.notes)
+
+
 def test_a_border_that_the_image_does_not_show_stays() -> None:
     image, truth, _ = balls(fat=62.0, noise=5.0)
     assert np.array_equal(correct_labels(image, truth).labels.labels, truth.labels)
