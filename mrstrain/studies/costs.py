@@ -33,6 +33,8 @@ _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _COMPARE_GIB, _OTHER_GIB = 1.0, 1.5  # a comparison: of it, and of each of its processes
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
 _USUAL_CELLS = 60e3
+_MANY_CELLS, _ENOUGH_CELLS = 2e5, 1e5  # as many as are told, and as are then proposed: published heels have 80,000
+_BY_EDGE = 2.3  # cells of a whole heel: proportional to this power of the inverse edge length, 2 to 4 mm
 _GIB = 1024.0**3
 
 
@@ -147,6 +149,13 @@ def costs(
             "`mrstrain run --quick` skips them."
         )
     warnings = ["there is too little free disk space."] if disk > free else []
+    if cells > _MANY_CELLS and any(stage.kind == "mesh" for stage in left):
+        edge = study.mesh.edge_mm
+        proposed = np.ceil(2.0 * edge * (cells / _ENOUGH_CELLS) ** (1.0 / _BY_EDGE)) / 2.0
+        warnings.append(
+            f"the mesh will have about {round(cells, -4):,.0f} cells (edge length {edge:g} mm), which takes long to "
+            f"make and to simulate. With edge_mm = {proposed:g} under [mesh], it has about {_ENOUGH_CELLS:,.0f}."
+        )
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
