@@ -133,6 +133,12 @@ class Interfaces:
         if placed is None or any(np.abs(t - np.rint(t)).max() > ALIGNED_INDEX for t in placed[1]):
             return self.at(grid.points(where), gradient)
         order, along = np.argsort(placed[0]), tuple(np.rint(t).astype(np.int64) for t in placed[1])
+        if self.of_bone_alone and not gradient:  # beside the bone, its distance is also the depth of the tissue
+            away = -_at_whole_indices(self.depth[self.rest], [along[axis] for axis in order]).transpose(placed[0])[
+                where
+            ]
+            m = np.tanh(np.maximum(away, 0.0) / self.reach_mm)
+            return np.stack([m, self.reach_mm * m**2], axis=-1)[..., None]
         return self._of_depths(*self._depths(frozen(where, np.bool_), order, along, gradient, corners=8))
 
     def _depths(
@@ -166,6 +172,16 @@ class Interfaces:
         if self.rest >= 0:
             out[own == self.rest] = 0.0
         return out
+
+
+def _at_whole_indices(coefficients: FloatArray, along: Sequence[IntArray]) -> FloatArray:
+    """A spline at whole indices along each axis, with coefficients mirrored beyond the ends of these."""
+    for axis, index in enumerate(along):
+        last = coefficients.shape[axis] - 1
+        mirrored = (np.abs((index + step + last) % max(2 * last, 1) - last) for step in (-1, 0, 1))
+        before, at, after = (coefficients.take(each, axis) for each in mirrored)
+        coefficients = (before + 4.0 * at + after) / 6.0
+    return coefficients
 
 
 def _room_for(count: int, gradient: bool) -> tuple[IntArray, FloatArray, FloatArray]:

@@ -203,9 +203,13 @@ def test_at_voxels_of_the_interfaces_only_three_coefficients_are_summed(spline, 
     assert np.unique(at[:, 0, 0]).size > 100
     between = grid.moved_by(np.eye(3), 0.5 * own.spacing_mm[0] * own.direction[:, 0])
     np.testing.assert_array_equal(turned.borders.on_grid(between, where), turned.borders.at(between.points(where)))
-    for near in (grid, between):
-        alone = turned.borders.on_grid(near, where, gradient=False)
-        np.testing.assert_allclose(alone, turned.borders.at(near.points(where))[..., :1], atol=1e-9)
+    everywhere = Mask(own, np.ones(own.shape, dtype=bool))
+    bone = Mask(own, turned.borders.own == turned.borders.rest)
+    of_bone = Interfaces.of(LabelMap(own, everywhere.inside.astype(int), {1: "tissue"}), bone, REACH_MM)
+    for near, of in ((grid, turned.borders), (between, turned.borders), (grid, of_bone), (between, of_bone)):
+        alone = of.on_grid(near, where, gradient=False)
+        np.testing.assert_allclose(alone, of.at(near.points(where))[..., :1], atol=1e-9)
+    assert of_bone.of_bone_alone
 
 
 def test_files_with_the_same_borders_share_them_and_no_others_do(spline, borders, tmp_path):
