@@ -48,7 +48,7 @@ def is_thick(spacing_mm: FloatArray) -> bool:
     return bool(spacing_mm.max() > _THICKEST * spacing_mm.min())
 
 
-def bone_to_rim(image: Image, bone: Mask, body: Mask, *, by_voxel: bool = False) -> tuple[Mask, float]:
+def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None = None) -> tuple[Mask, float]:
     """The bone of a mask, with its surface moved by its mean distance to the outer edge of the dark rim.
 
     It comes with the share of the mask's surface at which this distance is known: .29 to .94 on phantom heels, about 0
@@ -62,9 +62,9 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, by_voxel: bool = False)
     times as thick as the other voxel edges, the surface stays. ``image`` has no bias field; the bone and the ``body``,
     bone included, are on its grid. Beside what is not of the body, such as another bone, a rim is seen all the same.
 
-    With ``by_voxel``, the surface then lies at the rim itself, voxel by voxel, where it is still off by more than a
-    quarter of a voxel (root mean square in a neighbourhood of 4 mm), which an exact mask hardly is. Tendon must then be
-    left out of the body: a rim beside it goes on as in a thick cortex.
+    If it is given which tissue is as dark as a rim (``dark``, (ni, nj, nk)), the surface then lies at the rim itself,
+    voxel by voxel, where it is still off by more than a quarter of a voxel (root mean square in a neighbourhood of 4
+    mm), which an exact mask hardly is. Beside that tissue, where a rim has no end, it stays where the means moved it.
     """
     spacing = image.grid.spacing_mm
     if is_thick(spacing):
@@ -89,9 +89,11 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, by_voxel: bool = False)
         shown.append(float(known[surface].mean()) if surface.any() else 0.0)
         off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
         depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)
-    if by_voxel:
-        squares = _mean_along(*at_surface(0.0), (depth_of_rim - depth) ** 2, _ROUGH_MM / spacing)
-        depth = np.where(rims.seen & (squares > (_ROUGH * edge_mm) ** 2), depth_of_rim, depth)
+    if dark is not None:
+        seen = rims.seen & ~within(dark[box], spacing, 0.5 * reach_mm)
+        surface, _ = at_surface(0.0)
+        squares = _mean_along(surface, surface & seen, (depth_of_rim - depth) ** 2, _ROUGH_MM / spacing)
+        depth = np.where(seen & (squares > (_ROUGH * edge_mm) ** 2), depth_of_rim, depth)
     found = bone.inside.copy()
     found[box] = np.where(rims.near & ~rims.core, depth > 0.0, given)
     return Mask(bone.grid, found), shown[0]

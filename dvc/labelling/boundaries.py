@@ -114,10 +114,10 @@ def correct_labels(
         notes.append("The bones are unchanged: slices are over 2.1 times as thick as the other voxel edges.")
     new_bones = np.zeros_like(given)
     tissues = (given == number for number in np.unique(given[body & ~bones]))
-    around = whole & ~bones & ~new_skin & ~as_dark_as_rims(even, bones, tissues)
+    dark, around = as_dark_as_rims(even, bones, tissues), whole & ~bones & ~new_skin
     for number in np.unique(given[bones]):
         bone = given == number
-        found_bone = bone_to_rim(even, Mask(grid, bone), Mask(grid, bone | around), by_voxel=True)[0].inside
+        found_bone = bone_to_rim(even, Mask(grid, bone), Mask(grid, bone | around), dark=dark)[0].inside
         new_bones[np.where(fixed, bone, found_bone) & body] = number
     new_skin &= new_bones == 0
     watch(0.9)
