@@ -121,7 +121,7 @@ def regression_told(rows: Sequence[Agreement], model: str) -> str:
         told += [f"{name} slope {slope}, R² {r2}"] if slope else []
     several = " over the loads" * (len({row.load for row in rows if row.model == model}) > 1)
     why = " (best by area)" * (len({row.model for row in rows}) > 1)
-    means = "Equal fields: 1 and 1. If the strain is in other places than measured, R² is near 0."
+    means = "Slope and R² are 1 if the fields are equal; R² is near 0 if the strain is in other places than measured."
     return f"Cell by cell, {model}{why} on the measurement: {'; '.join(told)}{several}. {means}" if told else ""
 
 

@@ -34,5 +34,5 @@ def limitations(loads: Sequence[LoadComparison]) -> list[str]:
             what = "the error model needs the distance to bone, so the measurement uncertainty is unknown"
             soft = ", ".join(loads[0].labels.names.values())
             notes.append(f"The label map has no bone; all of its labels ({soft}) are compared as soft tissue.")
-        notes.append(f"{unknown}: {what} and no difference is significant.")
+        notes.append(f"{unknown}: {what}, and no difference can be tested for significance.")
     return notes

@@ -51,11 +51,11 @@ _CLOSING = Section(
         "information on location: two fields may have the same curve and differ everywhere. Overlap (Dice), distances "
         "of centroids, the Hausdorff distance (95th percentile) and the agreement cell by cell show where the fields "
         "differ.",
-        "Intervals and the grey band have 95 % coverage. They come from the error model of the registration: true "
-        "strain fields that are consistent with the measured one are sampled, and the area between the model's curve "
-        "and that of each sample is computed. An interval may exclude the area as measured, because noise and "
+        "Intervals and the grey band have 95 % coverage. They come from the error model of the registration: "
+        "truths that agree with the measurement are drawn from it, and the area between the model's curve and that of "
+        "each drawn truth is computed. An interval may exclude the area as measured, because noise and "
         "smoothing shift the measured curve. Two models differ significantly if one has the smaller area in at least "
-        "97.5 % of the samples, whose spread is widened like the intervals.",
+        "97.5 % of the drawn truths, whose spread is widened like the intervals.",
         "A measurement without a label map smooths strain discontinuities between soft tissues over 3 to 5 mm (one "
         "smooth spline also those at the bone), and noise increases small shear strains; a model does neither. A "
         "comparison cannot show effects that the measurement cannot detect: scanner distortion, creep during a scan, "
@@ -291,9 +291,9 @@ def _tissues(one: LoadComparison) -> Table:
          "perfect model, mL"),
         cells(a for a in one.areas if a.model != NOTHING),
         "As measured: with the noise and smoothing of the measurement. Estimate and interval: corrected for both by "
-        "the error model. Perfect model: the area that noise alone would cause; an interval whose lower end is smaller "
-        "begins at 0, because a perfect model is not excluded. Areas of tissues do not add up to that of all soft "
-        "tissue, in which over- and underestimates cancel."
+        "the error model. Perfect model: the area that noise (and, if given, errors of the inputs) would cause; an "
+        "interval whose lower end is smaller begins at 0, because a perfect model is not excluded. Areas of tissues "
+        "do not add up to that of all soft tissue, in which over- and underestimates cancel."
         + f" {UNNAMED}: tissue of the mesh whose name is not in the label map and that lies outside all labels."
         * any(a.tissue == UNNAMED for a in one.areas),
         cells(a for a in one.areas if a.model == NOTHING),

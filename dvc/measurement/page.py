@@ -39,8 +39,8 @@ _TWIN = (
     "like the real one. Its true strain is the measured strain above, so the table shows the error that the noise and "
     "texture of these images cause. Two caveats: strain that the registration smooths away is missing from the warp, "
     "which makes this error smaller than the true one; denoising removes texture, which makes it larger. Error bars of "
-    "a tissue are widened by the factor where fewer voxels than expected lie within the claimed error, or where a "
-    "percentile falls outside its interval. They are never narrowed."
+    "a tissue are widened by the factor where fewer voxels than expected lie within them, or where a percentile "
+    "falls outside its interval. They are never narrowed."
 )
 
 
@@ -212,7 +212,7 @@ def error_tables(bars: ErrorBars) -> list[Table]:
             tables.append(_component_table(bars.uncertainty.components))
     if bars.twin:
         claims = bars.uncertainty is not None
-        claimed = ("voxels within the claimed error", "expected at least", "intervals widened, times")
+        claimed = ("voxels within the error bars", "expected at least", "intervals widened, times")
         head = ("region", "error (rms)", "bias", *(claimed * claims))
         lines = tuple((row.region, row.rms_error, row.bias, *(_claimed(row) if claims else ())) for row in bars.twin)
         tables.append(Table("Check by a synthetic warp of this pair (twin)", head, lines, _TWIN))

@@ -170,10 +170,10 @@ def accuracy(
     """Measure the error of an engine or preset on phantoms, by tissue, position and strain; also noise and resolution.
 
     By default 90 registrations with gauss-newton-bone: nine motions of two heels, each with voxels of 0.8 mm at SNR
-    25, 12 and 50, and with voxels of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. Engines that do not keep the bone
-    rigid, such as gauss-newton, also get eight shear waves, which show the spatial resolution. --spacing and --snr
-    replace these conditions: without --spacing, voxels are then 0.8 mm; without --snr, the SNR is 25. An interrupted
-    run resumes.
+    25, 12 and 50, and with voxels of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. Presets that do not keep the
+    bone rigid, such as gauss-newton (one smooth spline), also get eight shear waves: the spatial resolution. --spacing
+    and --snr replace these conditions: without --spacing, voxels are then 0.8 mm; without --snr, the SNR is 25. An
+    interrupted run resumes.
     """
     from mrstrain.measurement.engines import AT_BONE
     from mrstrain.truth.accuracy import CONDITIONS, SEEDS

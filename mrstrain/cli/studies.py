@@ -132,7 +132,12 @@ def cohort(
 
 
 def demo(
-    out: Out = Path("demo"),
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder for the images, the study and its results; created if missing.", rich_help_panel="Output"
+        ),
+    ] = Path("demo"),
     seed: Annotated[int, typer.Option(min=1, help="Seed of the phantom.")] = 1,
     full: Annotated[
         bool,

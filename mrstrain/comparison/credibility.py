@@ -37,7 +37,7 @@ _ABOUT = (
 )
 CODE = (
     "Order of convergence of displacement and its gradient (closed-form solution, nearly incompressible tissue): P1 "
-    "2.01 and 1.01, MINI 2.08 and 1.32, P2 3.08 and 2.01 (benchmarks, The finite elements)"
+    "2.01 and 1.01, MINI 2.08 and 1.32, P2 3.08 and 2.01 (documentation, Finite elements: measurements)"
 )
 """Figures of the documentation, which a test compares with it."""
 COMPARATOR = (

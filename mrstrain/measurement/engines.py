@@ -48,8 +48,8 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
             return smooth
         if borders and not labelled and how.align != "bone":
             raise InputError(
-                "`borders` needs a label map: labels (--labels), or images aligned on the bone: align bone (--align "
-                "bone). Otherwise leave it out."
+                "`borders` (--borders) needs a label map (`labels`), or images that are aligned on the bone (`align`). "
+                "Give one of these, or leave out `borders`."
             )
         return default_engine(smooth, labelled=labelled, on_bone=how.align == "bone")
     if bending is not None or volume is not None:

@@ -69,7 +69,7 @@ class BoneAndBody(Options):
     bone: Path | None = None
     """Mask of the bone on the unloaded image."""
     tissue: Path | None = None
-    """Mask of the whole body part, bone included. Default: found by an intensity threshold."""
+    """Tissue mask: the body, bones included. Default: found by an intensity threshold."""
 
 
 class Marks(Options):
@@ -120,8 +120,8 @@ class SubjectFiles(BoneAndBody):
     """What is known of the unloaded image: its bone, body and tissues."""
 
     bone: Path | None = None
-    """Mask of the bone on the unloaded image; the rigid motion of this bone is removed. With --labels auto, its surface
-    is moved to the dark rim of the bone."""
+    """Mask of the bone on the unloaded image; the rigid motion of this bone is removed. In `register --labels auto`,
+    its surface is moved to the dark rim of the bone."""
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None
@@ -151,8 +151,7 @@ class RecordedFiles(SubjectFiles):
     bone: Path | None = None
     """Mask of the bone on the unloaded image; the displacement is zero in it. Default: that of the measurement."""
     tissue: Path | None = None
-    """Mask of the whole body part, bone included. Default: that of the measurement, or found by an intensity
-    threshold."""
+    """Tissue mask: the body, bones included. Default: that of the measurement, or found by an intensity threshold."""
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone. Default: that of the measurement, unless --labels is given."""
     labels: Path | None = None
@@ -196,8 +195,9 @@ class EngineOptions(Options):
     """Registration engine: gauss-newton or elastix. Default: gauss-newton; with --preset or --parameters, elastix."""
     borders: Flag | None = None
     """gauss-newton: allow strain discontinuities at the tissue interfaces of --labels, or without labels at the surface
-    of the bone, as the image shows it near that of the mask. Default: on, where there are labels or a bone to align on;
-    disable it if label boundaries are wrong by more than one voxel."""
+    of the bone, which is moved from that of the mask to where the image shows it. Disable it if label boundaries are
+    wrong by more than one voxel: one smooth spline is then fitted. Default: on, where there are labels or a bone to
+    align on."""
     preset: str | None = None
     """Built-in elastix parameters: heel-mr."""
     parameters: tuple[Path, ...] = ()

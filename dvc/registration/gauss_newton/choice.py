@@ -44,7 +44,9 @@ class Choice(Regularisation):
             return f"The weight of the volume change was fixed at {self.weights.volume:g}/mm3."
         found = f"at least {100.0 * self.asked:.1f} % in 1 % of the soft tissue"
         if not self.frees_volume:
-            return f"Incompressibility was kept: without it, the volume changes by {found}, no more than by noise."
+            return (
+                f"Incompressibility was enforced: without it, volumes would change by {found}, no more than by noise."
+            )
         relaxed = f"Incompressibility was relaxed: the images indicate volume changes of {found}."
         return f"{relaxed} Only the gradient of the volume change was penalised ({self.weights.volume_gradient:g}/mm)."
 

@@ -103,7 +103,7 @@ def fit_with_interfaces(
     elif stage.slab_has_skin:
         in_skin = choose(stage.slab, coefficients, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
     else:
-        in_skin = Choice(weights, "rigidity at its default, because the image shows too little skin")
+        in_skin = Choice(weights, "the weight is at its default, because the image shows too little skin")
     progress(_DONE[1])
     choice = Choice(in_skin.weights, "bending fixed beforehand")
     if parameters.bending is None:

@@ -59,7 +59,7 @@ def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(wr
     assert record["parameters"]["engine"] == "gauss-newton"
     assert record["parameters"]["gauss_newton"]["volume"] is None
     assert told["weights"]["volume"] == USUAL_VOLUME
-    assert "Incompressibility was kept" in told["change_of_volume"]["rule"]
+    assert "Incompressibility was enforced" in told["change_of_volume"]["rule"]
     assert record["parameters"]["stages"] == []
     assert "gauss-newton" in (written / "out" / "report.html").read_text()
 
