@@ -62,9 +62,11 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
     times as thick as the other voxel edges, the surface stays. ``image`` has no bias field; the bone and the ``body``,
     bone included, are on its grid. Beside what is not of the body, such as another bone, a rim is seen all the same.
 
-    If it is given which tissue is as dark as a rim (``dark``, (ni, nj, nk)), the surface then lies at the rim itself,
-    voxel by voxel, where it is still off by more than a quarter of a voxel (root mean square in a neighbourhood of 4
-    mm), which an exact mask hardly is. Beside that tissue, where a rim has no end, it stays where the means moved it.
+    If it is given which tissue is as dark as a rim (``dark``, (ni, nj, nk)), a surface that the means moved encloses as
+    many voxels as the rim does: distances from a curved surface are smooth, which alone would move it inward. Then it
+    lies at the rim itself, voxel by voxel, where it is still off by more than a quarter of a voxel (root mean square in
+    a neighbourhood of 4 mm), which an exact mask hardly is. Beside that tissue, where a rim has no end, it stays where
+    the means moved it.
     """
     spacing = image.grid.spacing_mm
     if is_thick(spacing):
@@ -88,7 +90,11 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
         surface, known = at_surface(clear)
         shown.append(float(known[surface].mean()) if surface.any() else 0.0)
         off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
-        depth = depth + np.where(np.abs(off) >= least * edge_mm, off, 0.0)
+        moves = np.abs(off) >= least * edge_mm
+        depth = depth + np.where(moves, off, 0.0)
+        if dark is not None:
+            there = moves & rims.near & ~rims.core & rims.seen & (clear_mm > clear * reach_mm)
+            depth -= np.where(moves, _level(depth[there], int(np.count_nonzero(rims.found & there))), 0.0)
     if dark is not None:
         seen = rims.seen & ~within(dark[box], spacing, 0.5 * reach_mm)
         surface, _ = at_surface(0.0)
@@ -97,6 +103,11 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
     found = bone.inside.copy()
     found[box] = np.where(rims.near & ~rims.core, depth > 0.0, given)
     return Mask(bone.grid, found), shown[0]
+
+
+def _level(values: FloatArray, count: int) -> float:
+    """The value that so many of the values exceed."""
+    return float(np.sort(values)[len(values) - count - 1]) if 0 < count < len(values) else 0.0
 
 
 def as_dark_as_rims(image: Image, bones: BoolArray, tissues: Iterable[BoolArray]) -> BoolArray:
