@@ -71,3 +71,12 @@ def test_no_page_keeps_a_note_of_its_writer() -> None:
     pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md"), *(ROOT / "benchmarks").rglob("*.md")]
     notes = [(page.name, found[0]) for page in pages for found in NOTE_TO_SELF.finditer(page.read_text())]
     assert not notes, notes
+
+
+def test_the_page_of_commands_lists_them_all() -> None:
+    from typer.main import get_command
+
+    from mrstrain.cli.app import app
+
+    listed = re.findall(r"`mrstrain ([a-z]+)", (DOCS / "reference" / "commands.md").read_text())
+    assert set(listed) == set(get_command(app).commands)  # type: ignore[attr-defined]
