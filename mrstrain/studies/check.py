@@ -274,10 +274,10 @@ class _Look:
             self.notes.append(
                 f"{engine.name} has no error model, so results will have no intervals; `mrstrain accuracy` makes one."
             )
-        elif model.preset != engine.name:
-            self.notes.append(
-                f"The error model was made for {model.preset}, but {engine.name} will be used, so results will have no "
-                f"intervals; `mrstrain accuracy --preset {as_typed(engine.name)}` makes one for it."
+        elif model.preset not in engine.may_be:
+            self.wrong.append(
+                f"{self.study.at('registration', 'error_model')}: this error model is for {model.preset}, but "
+                f"{engine.name} will be used; `mrstrain accuracy --preset {as_typed(engine.name)}` makes one for it."
             )
 
     def at_meshing(self, labels: LabelMap) -> None:
