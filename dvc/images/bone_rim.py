@@ -35,17 +35,12 @@ NUMBERS = {
     "local_mean": [_LOCAL, _LEAST_LOCAL, _CLEAR_LOCAL], "least_share": _LEAST_SHARE,
     "of_deepest": _OF_DEEPEST, "thickest": _THICKEST,
 }  # fmt: skip
-"""Every number that determines where a surface is moved to, for a record."""
+"""Every number that determines where a surface is moved to if no dark tissue is known, for a record."""
 
 
 def reach_of(spacing_mm: FloatArray) -> float:
     """How far a surface is moved at most, mm: 2.5 times the mean voxel edge."""
     return _REACH * float(spacing_mm.mean())
-
-
-def is_thick(spacing_mm: FloatArray) -> bool:
-    """Whether slices are so thick that rims are not seen in all directions: no surface is moved then."""
-    return bool(spacing_mm.max() > _THICKEST * spacing_mm.min())
 
 
 def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None = None) -> tuple[Mask, float]:
@@ -63,13 +58,14 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
     bone included, are on its grid. Beside what is not of the body, such as another bone, a rim is seen all the same.
 
     If it is given which tissue is as dark as a rim (``dark``, (ni, nj, nk)), a surface that the means moved encloses as
-    many voxels as the rim does: distances from a curved surface are smooth, which alone would move it inward. Then it
-    lies at the rim itself, voxel by voxel, where it is still off by more than a quarter of a voxel (root mean square in
-    a neighbourhood of 4 mm), which an exact mask hardly is. Beside that tissue, where a rim has no end, it stays where
-    the means moved it.
+    many voxels as the rim does: distances from a curved surface are smooth, which alone would move it inward (by a
+    quarter of a voxel at most). Then it lies at the rim itself, voxel by voxel, where it is still off by more than a
+    quarter of a voxel (root mean square in a neighbourhood of 4 mm), which an exact mask hardly is. Beside that tissue,
+    where a rim has no end, it stays where the means moved it. In thick slices, there is this last step alone.
     """
     spacing = image.grid.spacing_mm
-    if is_thick(spacing):
+    is_thick = bool(spacing.max() > _THICKEST * spacing.min())
+    if is_thick and dark is None:
         return bone, 0.0
     reach_mm, edge_mm = reach_of(spacing), float(spacing.mean())
     box = bone.box(int(np.ceil((reach_mm + _TRUNCATE * _AROUND_MM) / spacing.min())))
@@ -86,15 +82,17 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
         surface = rims.near & (np.abs(depth) < 0.55 * edge_mm)  # beside a plane: 0.52
         return surface, surface & rims.seen & (clear_mm > clear * reach_mm)
 
-    for around_mm, least, clear in ((mean_mm, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)):
+    means = (mean_mm, _LEAST, _CLEAR), (_LOCAL * edge_mm, _LEAST_LOCAL, _CLEAR_LOCAL)
+    for around_mm, least, clear in () if is_thick else means:
         surface, known = at_surface(clear)
         shown.append(float(known[surface].mean()) if surface.any() else 0.0)
         off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
         moves = np.abs(off) >= least * edge_mm
         depth = depth + np.where(moves, off, 0.0)
-        if dark is not None:
+        if dark is not None and around_mm == mean_mm:
             there = moves & rims.near & ~rims.core & rims.seen & (clear_mm > clear * reach_mm)
-            depth -= np.where(moves, _level(depth[there], int(np.count_nonzero(rims.found & there))), 0.0)
+            level_mm = _exceeded_by(depth[there], int(np.count_nonzero(rims.found & there)))
+            depth -= np.where(moves, np.clip(level_mm, -_ROUGH * edge_mm, _ROUGH * edge_mm), 0.0)
     if dark is not None:
         seen = rims.seen & ~within(dark[box], spacing, 0.5 * reach_mm)
         surface, _ = at_surface(0.0)
@@ -102,18 +100,18 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
         depth = np.where(seen & (squares > (_ROUGH * edge_mm) ** 2), depth_of_rim, depth)
     found = bone.inside.copy()
     found[box] = np.where(rims.near & ~rims.core, depth > 0.0, given)
-    return Mask(bone.grid, found), shown[0]
+    return Mask(bone.grid, found), shown[0] if shown else 0.0
 
 
-def _level(values: FloatArray, count: int) -> float:
-    """The value that so many of the values exceed."""
+def _exceeded_by(values: FloatArray, count: int) -> float:
+    """The value that so many of the values exceed; 0 if none or all of them should."""
     return float(np.sort(values)[len(values) - count - 1]) if 0 < count < len(values) else 0.0
 
 
-def as_dark_as_rims(image: Image, bones: BoolArray, tissues: Iterable[BoolArray]) -> BoolArray:
-    """Voxels (ni, nj, nk) of those tissues that are as dark as the rims of bones, such as tendon."""
+def as_dark_as_rims(image: Image, bones: BoolArray, soft: BoolArray, tissues: Iterable[BoolArray]) -> BoolArray:
+    """Voxels (ni, nj, nk) of those tissues that are as dark as the rims of bones in ``soft`` tissue, such as tendon."""
     spacing = image.grid.spacing_mm
-    beside = within(bones, spacing, reach_of(spacing)) & within(~bones, spacing, reach_of(spacing))
+    beside = within(bones, spacing, reach_of(spacing)) & within(~bones, spacing, reach_of(spacing)) & (bones | soft)
     dark = np.zeros_like(bones)
     if beside.any():
         blurred = gaussian_filter(image.values, _BLUR_MM / spacing)
@@ -132,8 +130,6 @@ class _Rims:
     near: BoolArray  # where surfaces can move
     seen: BoolArray  # where the image shows the edge of a rim
     goes_on: BoolArray  # as dark as a rim, but beyond its greatest thickness
-    blurred: Float32Array  # image
-    dark: float  # brightness of the rims
 
     @classmethod
     def of(cls, values: Float32Array, given: BoolArray, soft: BoolArray, spacing_mm: FloatArray) -> Self:
@@ -165,7 +161,7 @@ class _Rims:
         found |= binary_fill_holes(found)
         seen = near & known & (beside > _LEAST_STEP * dark)
         goes_on = as_dark & ~found & binary_dilation(found) | found & (outside > reach_mm - spacing_mm.min())
-        return cls(found, core, near, seen, goes_on, blurred, dark)
+        return cls(found, core, near, seen, goes_on)
 
 
 def _mean_along(surface: BoolArray, known: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:

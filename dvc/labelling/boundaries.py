@@ -1,18 +1,20 @@
 """A label map that was drawn or made before, corrected: by the image, or near a few marks."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from dvc.arguments import checked
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.images.bias_field import without_bias_field
 from dvc.images.bone_names import is_bones_name
-from dvc.images.bone_rim import as_dark_as_rims, bone_to_rim, is_thick, reach_of
+from dvc.images.bone_rim import as_dark_as_rims, bone_to_rim, reach_of
 from dvc.images.depth import depth_mm, moved_mm
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import fill_missing
@@ -110,23 +112,19 @@ def correct_labels(
             at_border = (np.abs(depth_mm(whole & ~skin, spacing)) <= reach) & ~fixed
             new_skin = np.where(at_border & ~bones, found.probability > 0.5, skin) & body
     watch(0.6)
-    if bones.any() and is_thick(spacing):
-        notes.append("The bones are unchanged: slices are over 2.1 times as thick as the other voxel edges.")
-    new_bones = np.zeros_like(given)
     tissues = (given == number for number in np.unique(given[body & ~bones]))
-    dark, around = as_dark_as_rims(even, bones, tissues), whole & ~bones & ~new_skin
-    for number in np.unique(given[bones]):
-        bone = given == number
+    around = whole & ~bones & ~new_skin
+    dark, new_bones = as_dark_as_rims(even, bones, around, tissues), np.zeros_like(bones)
+    for bone in _apart(given, bones):
         found_bone = bone_to_rim(even, Mask(grid, bone), Mask(grid, bone | around), dark=dark)[0].inside
-        new_bones[np.where(fixed, bone, found_bone) & body] = number
-    new_skin &= new_bones == 0
+        new_bones |= np.where(fixed, bone, found_bone) & body
     watch(0.9)
     others = body & ~bones & ~skin
-    corrected = np.where(new_bones > 0, new_bones, np.where(new_skin, _nearest(given, skin), 0))
-    corrected = np.where(body & (corrected == 0), _nearest(given, others), corrected)
+    corrected = np.where(new_bones, _nearest(given, bones), np.where(new_skin, _nearest(given, skin), 0))
+    corrected = np.where(body & ~new_bones & ~new_skin, _nearest(given, others), corrected)
     moved = {
         name: moved_mm(was, now, spacing)
-        for name, was, now in (("bone", bones, new_bones > 0), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
+        for name, was, now in (("bone", bones, new_bones), ("skin", ~(body & ~skin), ~(body & ~new_skin)))
         if (was & body).any()
     }
     watch(1.0)
@@ -169,6 +167,18 @@ def _without_labels(image: Image, body: BoolArray, spacing_mm: FloatArray, reach
         return unlabelled
     deep = distance_transform_edt(unlabelled, sampling=spacing_mm) > reach_mm
     return within(deep, spacing_mm, 1.5 * reach_mm) & unlabelled
+
+
+def _apart(labels: IntArray, bones: BoolArray) -> Iterator[BoolArray]:
+    """Bones (ni, nj, nk) that touch no other: labels that do are one, since between them the image may show no rim."""
+    if not bones.any():
+        return
+    numbers, of_label = np.unique(labels[bones], return_inverse=True)
+    parts = label(bones)[0][bones] - 1
+    touch = coo_array((np.ones(len(parts)), (of_label, parts)), shape=(len(numbers), int(parts.max()) + 1))
+    _, group = connected_components(touch @ touch.T, directed=False)
+    for one in range(int(group.max()) + 1):
+        yield np.isin(labels, numbers[group == one])
 
 
 def _nearest(labels: IntArray, where: BoolArray) -> IntArray:

@@ -33,8 +33,7 @@ _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _COMPARE_GIB, _OTHER_GIB = 1.0, 1.5  # a comparison: of it, and of each of its processes
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
 _USUAL_CELLS = 60e3
-_MANY_CELLS, _ENOUGH_CELLS = 2e5, 1e5  # as many as are told, and as are then proposed: published heels have 80,000
-_BY_EDGE = 2.3  # cells of a whole heel: proportional to this power of the inverse edge length, 2 to 4 mm
+_MANY_CELLS = 2e5  # that are warned of
 _GIB = 1024.0**3
 
 
@@ -149,12 +148,11 @@ def costs(
             "`mrstrain run --quick` skips them."
         )
     warnings = ["there is too little free disk space."] if disk > free else []
-    if cells > _MANY_CELLS and any(stage.kind == "mesh" for stage in left):
-        edge = study.mesh.edge_mm
-        proposed = np.ceil(2.0 * edge * (cells / _ENOUGH_CELLS) ** (1.0 / _BY_EDGE)) / 2.0
+    if cells > _MANY_CELLS and any(stage.name == "mesh" for stage in left):
         warnings.append(
-            f"the mesh will have about {round(cells, -4):,.0f} cells (edge length {edge:g} mm), which takes long to "
-            f"make and to simulate. With edge_mm = {proposed:g} under [mesh], it has about {_ENOUGH_CELLS:,.0f}."
+            f"the mesh will have about {round(cells, -4):,.0f} cells (edge length {study.mesh.edge_mm:g} mm), which "
+            "takes long to make and to simulate; a heel needs about 100,000 for a first look. For fewer, give a larger "
+            "edge_mm under [mesh], such as 4, or a label map with larger voxels."
         )
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:

@@ -195,17 +195,19 @@ def test_at_voxels_of_the_interfaces_only_three_coefficients_are_summed(spline, 
     corner = own.centre_mm - columns @ (own.spacing_mm[list(axes)] * (shape - 1) / 2.0)
     grid = Grid(tuple(shape.tolist()), own.spacing_mm[list(axes)], corner, columns)
     where = np.random.default_rng(3).uniform(size=grid.shape) < 0.1
+    everywhere = Mask(own, np.ones(own.shape, dtype=bool))
+    bone = Mask(own, turned.borders.own == turned.borders.rest)
+    of_bone = Interfaces.of(LabelMap(own, everywhere.inside.astype(int), {1: "tissue"}), bone, REACH_MM)
     at = turned.borders.at(grid.points(where))
     with monkeypatch.context() as patch:
         patch.delattr(Interfaces, "at")
         found = turned.borders.on_grid(grid, where)
+        patch.delattr(Interfaces, "_depths")
+        of_bone.on_grid(grid, where, gradient=False)
     np.testing.assert_allclose(found, at, atol=1e-9)
     assert np.unique(at[:, 0, 0]).size > 100
     between = grid.moved_by(np.eye(3), 0.5 * own.spacing_mm[0] * own.direction[:, 0])
     np.testing.assert_array_equal(turned.borders.on_grid(between, where), turned.borders.at(between.points(where)))
-    everywhere = Mask(own, np.ones(own.shape, dtype=bool))
-    bone = Mask(own, turned.borders.own == turned.borders.rest)
-    of_bone = Interfaces.of(LabelMap(own, everywhere.inside.astype(int), {1: "tissue"}), bone, REACH_MM)
     for near, of in ((grid, turned.borders), (between, turned.borders), (grid, of_bone), (between, of_bone)):
         alone = of.on_grid(near, where, gradient=False)
         np.testing.assert_allclose(alone, of.at(near.points(where))[..., :1], atol=1e-9)

@@ -7,6 +7,7 @@ from scipy.ndimage import binary_dilation
 from dvc import Grid, Image, LabelMap, correct_labels
 from dvc.arrays import BoolArray
 from dvc.errors import InputError
+from dvc.images.bone_rim import as_dark_as_rims
 from dvc.images.depth import depth_mm
 from phantoms import Heel, heel_grid, labels_of, misdrawn, scan
 
@@ -82,13 +83,25 @@ def test_bones_of_an_exact_map_stay_and_those_off_in_patches_are_moved(heel: tup
     assert off_mm(made.labels, truth, "bone")[1] < 0.28
 
 
-def test_bones_in_thick_slices_stay_and_it_is_told() -> None:
+def test_bones_that_touch_are_moved_as_one() -> None:
+    """Between two labels of one bone, the image shows no rim: each by itself, fat appeared inside the bone."""
     image, truth, _ = balls()
-    grid = Grid((50, 50, 17), (1.0, 1.0, 3.0), (-24.5, -24.5, -24.5))
-    drawn = np.where(binary_dilation(truth.labels == 1), 1, truth.labels)[:, :, ::3]
-    made = correct_labels(Image(grid, image.values[:, :, ::3]), LabelMap(grid, drawn, NAMES))
-    assert np.array_equal(made.labels.labels, drawn)
-    assert any("slices are over 2.1 times as thick" in note for note in made.notes)
+    halves = {**NAMES, 5: "cortical bone"}
+    two = np.where((truth.labels == 1) & (truth.grid.points()[..., 2] > 3.0), 5, truth.labels)
+    made = correct_labels(image, LabelMap(truth.grid, two, halves)).labels.labels
+    as_one = correct_labels(image, truth).labels.labels
+    assert np.array_equal(np.isin(made, (1, 5)), as_one == 1)
+    assert np.array_equal(made[made == 5], two[made == 5])
+
+
+def test_tendon_is_known_to_be_dark_although_there_is_air_beside_the_bone() -> None:
+    image, truth, _ = balls()
+    air = truth.grid.points()[..., 0] < -10.0
+    values = np.where(air, np.float32(2.0), image.values)
+    labels = np.where(air, 0, truth.labels)
+    bones, soft = labels == 1, (labels > 0) & (labels != 1)
+    tissues = [labels == number for number in (2, 3)]
+    assert np.array_equal(as_dark_as_rims(Image(truth.grid, values), bones, soft, tissues), labels == 3)
 
 
 def test_a_border_that_the_image_does_not_show_stays() -> None:

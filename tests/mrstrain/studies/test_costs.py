@@ -155,5 +155,5 @@ def test_a_mesh_of_very_many_cells_is_told_with_a_larger_edge_length(study, monk
     assert warned(2e5, stages) == []
     (line,) = warned(393_265, stages)
     assert line.startswith("the mesh will have about 390,000 cells (edge length 2 mm)")
-    assert "With edge_mm = 4 under [mesh]" in line
+    assert "give a larger edge_mm under [mesh]" in line
     assert warned(393_265, [stage for stage in stages if stage.kind != "mesh"]) == []
