@@ -134,10 +134,8 @@ class Interfaces:
             return self.at(grid.points(where), gradient)
         order, along = np.argsort(placed[0]), tuple(np.rint(t).astype(np.int64) for t in placed[1])
         if self.of_bone_alone and not gradient:  # beside the bone, its distance is also the depth of the tissue
-            away = -_at_whole_indices(self.depth[self.rest], [along[axis] for axis in order]).transpose(placed[0])[
-                where
-            ]
-            m = np.tanh(np.maximum(away, 0.0) / self.reach_mm)
+            inside = _at_whole_indices(self.depth[self.rest], [along[axis] for axis in order]).transpose(placed[0])
+            m = np.tanh(np.maximum(-inside[where], 0.0) / self.reach_mm)
             return np.stack([m, self.reach_mm * m**2], axis=-1)[..., None]
         return self._of_depths(*self._depths(frozen(where, np.bool_), order, along, gradient, corners=8))
 
@@ -175,7 +173,7 @@ class Interfaces:
 
 
 def _at_whole_indices(coefficients: FloatArray, along: Sequence[IntArray]) -> FloatArray:
-    """A spline at whole indices along each axis, with coefficients mirrored beyond the ends of these."""
+    """A spline (mi, mj, mk) of coefficients (ni, nj, nk), mirrored beyond their ends, at whole indices of each axis."""
     for axis, index in enumerate(along):
         last = coefficients.shape[axis] - 1
         mirrored = (np.abs((index + step + last) % max(2 * last, 1) - last) for step in (-1, 0, 1))

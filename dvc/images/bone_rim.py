@@ -27,7 +27,8 @@ _OF_DEEPEST = 0.5  # of the bone's greatest depth: the first mean is not of its 
 _THICKEST = 2.1  # over the thinnest voxel edge: in thicker slices, rims are not seen in all directions
 _LEAST, _LEAST_LOCAL = 0.2, 0.5  # voxels: smaller means are noise
 _CLEAR, _CLEAR_LOCAL = 1.0, 2.0  # reaches from where the dark goes on: nearer distances are left out of the means
-_ROUGH_MM, _ROUGH = 4.0, 0.25  # mm and voxels: a surface that is farther off in this neighbourhood goes to the rim
+_ROUGH_MM, _ROUGH = 4.0, 0.25  # mm and voxels: a surface farther off in this neighbourhood goes to the rim
+_SHIFT = 0.25  # voxels, at most, so that a surface encloses as many voxels as its rim
 _LEAST_SHARE = 0.1  # of the surface there that shows a rim: below, the distance tends to zero
 NUMBERS = {
     "reach": _REACH, "blur_mm": _BLUR_MM, "around_mm": _AROUND_MM, "dark_percent": _DARK_PERCENT, "edge": _EDGE,
@@ -89,10 +90,10 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
         off = _mean_along(surface, known, depth_of_rim - depth, around_mm / spacing)
         moves = np.abs(off) >= least * edge_mm
         depth = depth + np.where(moves, off, 0.0)
-        if dark is not None and around_mm == mean_mm:
+        if dark is not None and least == _LEAST:
             there = moves & rims.near & ~rims.core & rims.seen & (clear_mm > clear * reach_mm)
             level_mm = _exceeded_by(depth[there], int(np.count_nonzero(rims.found & there)))
-            depth -= np.where(moves, np.clip(level_mm, -_ROUGH * edge_mm, _ROUGH * edge_mm), 0.0)
+            depth -= np.where(moves, np.clip(level_mm, -_SHIFT * edge_mm, _SHIFT * edge_mm), 0.0)
     if dark is not None:
         seen = rims.seen & ~within(dark[box], spacing, 0.5 * reach_mm)
         surface, _ = at_surface(0.0)
