@@ -9,9 +9,10 @@ whose fat is stiffer or softer at random, are compared with a measurement whose 
 the Gauss-Newton engine. The intervals should hold the area of each model with right inputs, on the mesh of the truth.
 
 The result is the coverage of the intervals; the pairs in the wrong order among those called significantly different;
-and the number of pairs called so (power). All is repeated with the inputs taken as exact. Skin is hardly strained here,
-so its areas do not count. The measurement follows its error model, so only the models are tested. Cases that are
-already in the file are not run again.
+and the number of pairs called so (power). All is repeated with the inputs taken as exact. The interval E +- 2 u_val of
+a statistic should hold the error of the model with right inputs, on the mesh of the truth, without an error of the
+measurement. Skin is hardly strained here, so it does not count. The measurement follows its error model, so only the
+models are tested. Cases that are already in the file are not run again.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from dvc.trust.truth_draws import TruthDraws
 from fe import LoadStep, NeoHooke, Plate, SolverOptions, Yeoh, cell_size_mm, mesh_steps, problems_of, solve, variation
 from mrstrain.records.provenance import versions
 from validate import ALL, ALL_LOADS, FeResult, LoadCase, Variant, compare_load, rank_over_loads
+from validate.comparison_error import AREA
 from validate.ranking import summed
 
 SPREAD = {"force": 0.03, "direction_deg": 2.0, "poisson": 0.5, "labels_mm": 0.4}
@@ -153,7 +155,7 @@ def variants_of(laws, mesh: TetMesh, coarse: TetMesh) -> dict[str, list[Variant]
         return None
     states = {name: state.checkpoint for name, state in base.items()}
     bone, of_bone = variation.with_bone(coarse, SPREAD["labels_mm"])
-    skin, of_skin = variation.with_skin(coarse, SPREAD["labels_mm"])
+    skin, of_skin = variation.with_tissue(coarse, "skin", SPREAD["labels_mm"])
     force = [variation.with_force(load, SPREAD["force"]) for load in LOADS]
     changed = {
         "force": (problems_of(coarse, laws, PLATE, force), 1.0),
@@ -226,6 +228,21 @@ def case(seed: int) -> dict[str, object] | None:
     return told(results, references)
 
 
+def true_error(exact, stated) -> float:
+    """The error of a statistic without errors of measurement, inputs and mesh."""
+    where, name = exact.fields.parts[stated.tissue], stated.statistic
+    volumes = exact.fields.volumes_ml[where]
+
+    def of(shear: np.ndarray) -> float:
+        if name.startswith("volume above"):
+            return float(volumes[shear > float(name.split()[-1])].sum())
+        order = np.argsort(shear)
+        share = np.cumsum(volumes[order]) / volumes.sum()
+        return float(shear[order][np.searchsorted(share, {"median": 0.5, "p95": 0.95}[name])])
+
+    return of(exact.fields.models[stated.model].max_shear[where]) - of(exact.fields.measured.max_shear[where])
+
+
 def told(results, references) -> dict[str, object]:
     """Intervals with the areas that they should hold, and pairs in their order, with inputs drawn and as exact."""
     areas, pairs = [], []
@@ -244,9 +261,22 @@ def told(results, references) -> dict[str, object]:
             said = [int(of.surely_below(b, a)) - int(of.surely_below(a, b)) for of in (band, exact)]
             pairs.append([load, a, b, gap, *said])
     errors = [
-        [e.load, e.model, e.tissue, e.statistic, e.error, e.u_num, e.u_input, e.u_d]
-        for one in results
+        [
+            e.load,
+            e.model,
+            e.tissue,
+            e.statistic,
+            true_error(exact, e),
+            e.error,
+            e.u_num,
+            e.u_input,
+            e.u_d,
+            e.low,
+            e.high,
+        ]
+        for one, exact in zip(results, references, strict=True)
         for e in one.errors
+        if e.statistic != AREA
     ]
     shears = {one.load: one.fields.measured.max_shear[one.fields.common] for one in results}
     strains = [[load, *np.quantile(shear, [0.5, 0.95]).tolist()] for load, shear in shears.items()]
@@ -270,7 +300,24 @@ def summary(cases: list[dict]) -> dict[str, object]:
         called = [row for row in pairs if row[k] != 0]
         wrong = sum(row[k] * row[3] < 0.0 for row in called)
         orders[name] = {"pairs": len(pairs), "called different": len(called), "in the wrong order": wrong}
-    return {"cases": len(cases), "coverage": held, "coverage_by": by, "mean_width_ml": width, "orders": orders}
+    return {
+        "cases": len(cases), "coverage": held, "coverage_by": by, "mean_width_ml": width, "orders": orders,
+        "coverage_of_errors": held_errors([row for case in cases for row in case["errors"]]),
+    }  # fmt: skip
+
+
+def held_errors(rows: list[list]) -> dict[str, dict[str, float]]:
+    """Share of the intervals E +- 2 u_val that hold the true error, and their number, by tissue and kind of statistic.
+
+    Statistics that are certain (0 mL above a level, in the model and in the measurement) do not count.
+    """
+    found: dict[str, list[bool]] = {}
+    for _, _, tissue, name, true, error, _, _, _, low, high in rows:
+        if tissue != "skin" and np.isfinite(error) and high > low:
+            kind = f"{tissue}, {'volume above a strain' if name.startswith('volume') else name}"
+            found.setdefault(kind, []).append(bool(low <= true <= high))
+            found.setdefault("all", []).append(found[kind][-1])
+    return {kind: {"held": float(np.mean(of)), "of": len(of)} for kind, of in found.items()}
 
 
 def main() -> None:

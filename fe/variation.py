@@ -74,12 +74,17 @@ def with_bone(mesh: TetMesh, thickness_mm: float) -> tuple[TetMesh, float]:
     return _moved(mesh, *_normals(mesh, every, _keys(mesh, mesh.facets[BONE])), -thickness_mm)
 
 
-def with_skin(mesh: TetMesh, thickness_mm: float, skin: str = SKIN) -> tuple[TetMesh, float]:
-    """A mesh whose skin (region of this name) is thicker on the inside; as `with_bone`."""
-    cells = mesh.regions[skin]
+def with_tissue(mesh: TetMesh, tissue: str, thickness_mm: float) -> tuple[TetMesh, float]:
+    """A mesh in which a tissue (region of this name) is thicker where it meets other tissues; as `with_bone`.
+
+    Surfaces of the bone and of the body stay.
+    """
+    cells = mesh.regions[tissue]
     others = np.setdiff1d(np.arange(len(mesh.cells)), cells)
-    keys = _keys(mesh, faces_of(mesh.cells[others]))
-    return _moved(mesh, *_normals(mesh, cells, keys), thickness_mm)
+    nodes, normals = _normals(mesh, cells, _keys(mesh, faces_of(mesh.cells[others])))
+    held = [np.unique(mesh.facets[name]) for name in (BONE, SKIN) if name in mesh.facets]
+    moving = ~np.isin(nodes, np.concatenate(held))
+    return _moved(mesh, nodes[moving], normals[moving], thickness_mm)
 
 
 def from_base(

@@ -21,9 +21,12 @@ from dvc.errors import InputError
 MESH = "mesh"
 """Name of the input that stands for the discretisation: its part of the uncertainty is u_num."""
 
-SHARED = ("force", "direction-along", "direction-across", "labels-bone", "labels-skin", "tape")
-"""Inputs that are the same for all models of a measurement, so that one draw of them holds for all. Any other input,
-such as the mesh or Poisson's ratio, is that of one model alone."""
+LABELS = "labels-"
+"""Beginning of the names of inputs that stand for the boundary of a tissue in the label map, such as labels-bone."""
+
+SHARED = ("force", "direction-along", "direction-across", "tape")
+"""Inputs that are the same for all models of a measurement, so that one draw of them holds for all; so are those that
+begin with `LABELS`. Any other input, such as the mesh or Poisson's ratio, is that of one model alone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +87,7 @@ class Sensitivity:
     @classmethod
     def of(cls, model: str, changes: Mapping[str, FloatArray], draws: int, seed: int) -> "Sensitivity":
         """The sensitivity of a model of this name to at least one input, with its draws."""
-        names = (name if name in SHARED else f"{model}: {name}" for name in changes)
+        names = (name if name in SHARED or name.startswith(LABELS) else f"{model}: {name}" for name in changes)
         streams = (np.random.default_rng([seed, zlib.crc32(name.encode())]) for name in names)
         return cls(changes, np.column_stack([stream.standard_normal(draws) for stream in streams]))
 

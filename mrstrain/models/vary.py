@@ -7,7 +7,10 @@ discretisation error. Variants with another force, material or interface start f
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 import fe
 from dvc import TetMesh
@@ -15,6 +18,7 @@ from dvc.atomic_files import write_whole
 from dvc.errors import MrstrainError
 from dvc.worker import Worker
 from fe import variation
+from fe.mesh_file import BONE, SKIN
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint
 from mrstrain.models.simulate import material_sets, simulate
 from mrstrain.models.variant_files import MESH, VARIANT, VariantRecord
@@ -23,9 +27,9 @@ from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.outcome import Outcome
+from validate.sensitivity import LABELS
 
 _SHORT = 0.2  # of the time of a whole solution: one that starts from the state of another
-_SKIN = "skin"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,11 +48,22 @@ class _Setting:
         return fe.problems_of(self.mesh, self.materials, self.plates, self.loads, self.fixed, self.element)
 
 
+@dataclass(frozen=True, slots=True)
+class _Whole:
+    """A variant that is simulated from the start, because no state of another solution is near."""
+
+    towards: Mapping[str, tuple[Vector, Vector]]  # outward normal and direction of shear by load
+    loads: Sequence[fe.LoadStep]
+    taped: bool
+    steps: float = 1.0
+
+
 def vary(
     mesh: Path, *, out: Path, simulation: options.SimulationOptions, loads: Sequence[fe.LoadStep],
     plate_options: options.PlateOptions, towards: Mapping[str, tuple[Vector, Vector]],
     coordinates: options.MeshCoordinates, uncertainty: Uncertainty, base: Path, coarse: Path | None = None,
-    voxel_mm: float = 0.0, tell: Callable[[str, float], None] = lambda _stage, _share: None,
+    voxel_mm: float = 0.0, boundaries_mm: Mapping[str, float] | None = None,
+    tell: Callable[[str, float], None] = lambda _stage, _share: None,
 ) -> Outcome:  # fmt: skip
     """Solve a material set with each input changed by one standard uncertainty.
 
@@ -66,6 +81,9 @@ def vary(
         Coarser mesh, in the coordinates of the image, on which everything is computed instead.
     voxel_mm : float
         Edge of a voxel of the label map, or the cube root of its volume.
+    boundaries_mm : mapping of tissue to float, optional
+        Standard uncertainty of the position of each soft tissue's boundary with others, mm, at least that of
+        ``uncertainty``; by default only the skin's boundary is uncertain.
     tell : callable
         Called with the current step and the fraction of the whole that is done.
     """
@@ -79,12 +97,14 @@ def vary(
         chosen.name, read, plates, loads, fe.fixed_facets(read, simulation.fixed), simulation.element,
         chosen.for_regions(read.regions)[0],
     )  # fmt: skip
-    changed, lines = _changes(setting, uncertainty, voxel_mm)
-    whole = ({} if coarse is None else {MESH: dict(towards)}) | _tilts(setting, uncertainty)
+    changed, lines = _changes(setting, uncertainty, voxel_mm, boundaries_mm)
+    whole = _wholes(setting, uncertainty, plate_options.taped, lines)
+    if coarse is not None:
+        whole = {MESH: _Whole(towards, loads, plate_options.taped)} | whole
     _remove_others(out, [*whole, *changed])
     solving = simulation.model_copy(update={"decks": False})
     complete, work = True, len(whole) + _SHORT * len(changed)
-    for number, (name, directions) in enumerate(whole.items()):
+    for number, (name, one) in enumerate(whole.items()):
         began: dict[str, float] = {}
 
         def watch(case: str, stage: str, share: float, number: int = number, began: dict[str, float] = began) -> None:
@@ -93,8 +113,9 @@ def vary(
 
         try:
             made = simulate.with_options(
-                place, out=out / name, simulation=solving, loads=loads, plate_options=plate_options, coordinates=how,
-                towards=directions, cores=Cores(workers=1, threads=1), progress=watch,
+                place, out=out / name, simulation=solving, loads=one.loads, coordinates=how, towards=one.towards,
+                plate_options=plate_options.model_copy(update={"taped": one.taped}),
+                cores=Cores(workers=1, threads=1), progress=watch,
             )  # fmt: skip
             complete = complete and made.complete
         except MrstrainError as failure:
@@ -105,8 +126,9 @@ def vary(
         of_base = base = out / MESH / chosen.name
         fine = fe.read_tet_mesh(mesh, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
         lines.append(_record_mesh(base, chosen.name, fine, read))
-    for name in whole.keys() - {MESH}:
-        _record(out / name / chosen.name, chosen.name, name, 1.0, of_base)
+    for name, one in whole.items():
+        if name != MESH:
+            _record(out / name / chosen.name, chosen.name, name, one.steps, of_base)
     states = _states(setting, base)
     failed = _solve_short(changed, states, out, of_base, chosen.name,
                           lambda done: tell("varying", (len(whole) + _SHORT * done) / work))  # fmt: skip
@@ -150,7 +172,7 @@ _MADE_FROM = "made-from.txt"
 
 
 def _changes(
-    setting: _Setting, spread: Uncertainty, voxel_mm: float
+    setting: _Setting, spread: Uncertainty, voxel_mm: float, boundaries_mm: Mapping[str, float] | None
 ) -> tuple[dict[str, tuple[list[fe.Problem], float]], list[str]]:
     """Changed problems by input, that start from the states of the unchanged ones, with the steps of each.
 
@@ -168,34 +190,59 @@ def _changes(
         if relative:
             laws = variation.with_stiffness(setting.materials, region, relative)
             made[f"stiffness-{region}"] = replace(setting, materials=laws), 1.0
-    if (thicker_mm := spread.labels_voxels * voxel_mm) > 0.0:
-        moving = {"labels-bone": variation.with_bone}
-        if any(region.casefold() == _SKIN for region in setting.mesh.regions):
-            moving["labels-skin"] = variation.with_skin
-        for name, move in moving.items():
-            try:
-                moved, share = move(setting.mesh, thicker_mm)
-                made[name] = replace(setting, mesh=moved), share
-            except MrstrainError as failure:
-                lines.append(f"{name}: not given. {failure}")
+    least_mm = spread.labels_voxels * voxel_mm
+    for name, move in _boundaries(setting.mesh, boundaries_mm, least_mm).items() if least_mm else ():
+        try:
+            moved, share = move(setting.mesh)
+            made[LABELS + name] = replace(setting, mesh=moved), share
+        except MrstrainError as failure:
+            lines.append(f"{LABELS}{name}: not given. {failure}")
     return {name: (of.problems(), steps) for name, (of, steps) in made.items()}, lines
 
 
-def _tilts(setting: _Setting, spread: Uncertainty) -> dict[str, dict[str, tuple[Vector, Vector]]]:
-    """Outward normal and direction of shear of each load with a tilted plate, by input."""
-    if not spread.direction_deg:
-        return {}
-    tilts: dict[str, dict[str, tuple[Vector, Vector]]] = {}
-    for name, along in (("direction-along", True), ("direction-across", False)):
+def _boundaries(
+    mesh: TetMesh, boundaries_mm: Mapping[str, float] | None, least_mm: float
+) -> Mapping[str, Callable[[TetMesh], tuple[TetMesh, float]]]:
+    """What moves each uncertain boundary by its standard uncertainty: of the bone, and of all tissues but the largest.
+
+    The largest tissue meets the others, so its boundary is theirs.
+    """
+    own_mm = {tissue.casefold(): mm for tissue, mm in (boundaries_mm or {SKIN: least_mm}).items()}
+    moving = {BONE: partial(variation.with_bone, thickness_mm=least_mm)}
+    largest = max(mesh.regions, key=lambda name: float(np.abs(mesh.volumes_mm3[mesh.regions[name]]).sum()))
+    for name in mesh.regions:
+        if name.casefold() in own_mm and (name != largest or boundaries_mm is None):
+            by_mm = max(least_mm, own_mm[name.casefold()])
+            moving[name.casefold()] = partial(variation.with_tissue, tissue=name, thickness_mm=by_mm)
+    return moving
+
+
+def _wholes(setting: _Setting, spread: Uncertainty, taped: bool, lines: list[str]) -> dict[str, _Whole]:
+    """Variants with a tilted plate or without tape; adds a sentence to ``lines`` if there can be none."""
+    made: dict[str, _Whole] = {}
+    for name, along in (("direction-along", True), ("direction-across", False)) if spread.direction_deg else ():
         turned = {
-            load: variation.tilted(plate, spread.direction_deg, along=along).axes.T.tolist()
+            load: _towards(variation.tilted(plate, spread.direction_deg, along=along))
             for load, plate in setting.plates.items()
         }
-        tilts[name] = {
-            load: ((-force[0], -force[1], -force[2]), (shear[0], shear[1], shear[2]))
-            for load, (force, shear, _) in turned.items()
-        }
-    return tilts
+        made[name] = _Whole(turned, setting.loads, taped)
+    if spread.tape:
+        pressed = [load for load in setting.loads if not load.sheared]
+        if not taped or any(plate.turns for plate in setting.plates.values()) or not pressed:
+            lines.append(
+                "tape: not given. It needs a load without shear, and a plate with tape that does not rotate (taped = "
+                "true, turns = false)."
+            )
+        else:
+            towards = {load.name: _towards(setting.plates[load.name]) for load in pressed}
+            made["tape"] = _Whole(towards, pressed, False, 1.0 / spread.tape)
+    return made
+
+
+def _towards(plate: fe.Plate) -> tuple[Vector, Vector]:
+    """Outward normal and direction of shear of a plate."""
+    force, shear, _ = plate.axes.T.tolist()
+    return (-force[0], -force[1], -force[2]), (shear[0], shear[1], shear[2])
 
 
 def _record_mesh(folder: Path, name: str, fine: TetMesh, coarse: TetMesh) -> str:

@@ -28,13 +28,17 @@ class Uncertainty(Options):
     """Standard uncertainty of the plate's forces, N; combined with ``force`` as the root of the sum of squares."""
     direction_deg: NotNegative = 0.0
     """Standard uncertainty of the plate's normal, in each of the two directions of tilt, degrees."""
+    tape: NotNegative = 0.0
+    """Standard uncertainty of how firmly the skin sticks to the plate, as a fraction of the difference between skin
+    that sticks and skin that slides without friction. It applies to loads without shear."""
     poisson: NotNegative = 0.0
     """Relative standard uncertainty of 0.5 - nu of every material."""
     stiffness: dict[str, NotNegative] = Field(default_factory=dict)
     """Relative standard uncertainty of the stiffness of a tissue, by the name of the tissue."""
     labels_voxels: NotNegative = 0.0
     """Standard uncertainty of the position of the bone's boundary and of the inner surface of the skin, in voxels of
-    the label map that is meshed."""
+    the label map that is meshed. If `label` made this label map, the boundaries of all soft tissues are uncertain, each
+    by the larger of this value and the one that follows from the probability of the tissue."""
     variants: Annotated[tuple[Path, ...], AfterValidator(_different)] = ()
     """Folders with further variants of models, each with a ``variant.toml``: of other codes, or from `converge`."""
     quick: Flag = False
@@ -52,13 +56,13 @@ class Uncertainty(Options):
     @property
     def solves(self) -> bool:
         """Whether there are variants to solve."""
-        given = (self.mesh, self.force, self.force_n, self.direction_deg, self.poisson, self.labels_voxels)
+        given = (self.mesh, self.force, self.force_n, self.direction_deg, self.tape, self.poisson, self.labels_voxels)
         return not self.quick and bool(any(given) or any(self.stiffness.values()))
 
     @property
     def solutions(self) -> tuple[int, int]:
         """About how many variants of a material set are solved as a whole, and how many from a converged state."""
-        whole = bool(self.mesh) + 2 * bool(self.direction_deg)
+        whole = bool(self.mesh) + 2 * bool(self.direction_deg) + bool(self.tape)
         moved = 2 * bool(self.labels_voxels)
         changed = sum(map(bool, (self.force or self.force_n, self.poisson, *self.stiffness.values())))
         return whole, changed + moved

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from dvc import Verdict
+from dvc.errors import InputError
 from dvc.report.page import Section
 from mrstrain.options.model import Options
 from mrstrain.records.durations import MESHING, TISSUES, comparison, usual_registration
@@ -136,19 +137,26 @@ def vary(
 ) -> StageResult:  # fmt: skip
     """Solve a material set with one input changed at a time; as `mrstrain.models.vary.vary`."""
     from dvc import read_labels
+    from dvc.labelling.boundary_position import position_sd_mm
     from fe import LoadStep
+    from mrstrain.measurement.label_files import read_made
     from mrstrain.models.vary import vary as run
     from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
     from mrstrain.options.uncertainty import Uncertainty
 
-    voxel_mm = float(read_labels(labels, names).grid.voxel_volume_mm3 ** (1 / 3))
+    voxel_mm, notes = float(read_labels(labels, names).grid.voxel_volume_mm3 ** (1 / 3)), list[str]()
+    try:
+        made = read_made(labels, names)
+    except InputError as lacking:  # only the boundaries of bone and skin are uncertain then
+        made = None
+        notes.append(str(lacking))
     simulation, plate = _chosen(SimulationOptions, options), _chosen(PlateOptions, options)
     done = run(
         mesh, simulation=simulation, plate_options=plate, coordinates=_chosen(MeshCoordinates, options),
         loads=[LoadStep(**load) for load in loads], uncertainty=Uncertainty.of(uncertainty), voxel_mm=voxel_mm,
-        tell=tell, **options,
+        boundaries_mm=None if made is None else position_sd_mm(made), tell=tell, **options,
     )  # fmt: skip
-    return StageResult(tuple(done.summary()), complete=done.complete, headline=done.lines[0])
+    return StageResult((*notes, *done.summary()), complete=done.complete, headline=done.lines[0])
 
 
 def drive(tell: Tell, *, mesh: Path, dvc: Path, **options: Any) -> StageResult:

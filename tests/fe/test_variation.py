@@ -63,8 +63,9 @@ def test_one_parameter_changes_and_the_others_stay() -> None:
 
 def test_bone_or_skin_is_thicker_by_as_much_and_no_other_surface_moves() -> None:
     mesh, face = pad(), 24.0 * 24.0
-    for move, thinner in ((variation.with_bone, "bone"), (variation.with_skin, "skin")):
-        moved, share = move(mesh, 0.5)
+    for (moved, share), thinner in (
+        (variation.with_bone(mesh, 0.5), "bone"), (variation.with_tissue(mesh, "skin", 0.5), "skin")
+    ):  # fmt: skip
         assert share == 1.0
         assert moved.cells.tolist() == mesh.cells.tolist()
         assert volume(moved, "fat") - volume(mesh, "fat") == pytest.approx(-0.5 * face, rel=1e-6)

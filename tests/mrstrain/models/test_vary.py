@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,21 +74,31 @@ def spread(**inputs: object) -> Uncertainty:
 
 
 def test_each_uncertain_input_has_a_solution_that_is_kept(given) -> None:
-    uncertain = spread(mesh=1.4, force=0.05, direction_deg=1.0, poisson=0.5, labels_voxels=0.5, stiffness={"fat": 0.2})
+    uncertain = spread(
+        mesh=1.4, force=0.05, direction_deg=1.0, tape=0.25, poisson=0.5, labels_voxels=0.5, stiffness={"fat": 0.2}
+    )
     done = vary(**given, uncertainty=uncertain)
     assert done.complete, done.lines
     found = {one.record.input: one for one in variant_folders([given["out"]])}
     assert set(found) == {
-        "mesh", "force", "direction-along", "direction-across", "poisson", "labels-bone", "labels-skin", "stiffness-fat"
+        "mesh", "force", "direction-along", "direction-across", "tape", "poisson", "labels-bone", "labels-skin",
+        "stiffness-fat",
     }  # fmt: skip
+    # skin that slides everywhere is four standard uncertainties away; without tape there is no load with shear
+    assert found["tape"].record.steps == 4.0
+    assert sorted(file.name for file in found["tape"].place.glob("*.vtu")) == ["Load2.vtu"]
     # cells 1.5 times as long, an assumed order of 1, and a safety factor of 1.25 on the interval of k = 2
     assert found["mesh"].record.steps == pytest.approx(2.0 * (1.5 - 1.0) / 1.25)
     assert found["mesh"].base is None
     assert {one.base.resolve() for name, one in found.items() if name != "mesh"} == {found["mesh"].place.resolve()}
     # each changed solution carries its own load, and strains the pad otherwise
-    shear = {name: read_result(name, one.place / "Load3.vtu").deformation for name, one in found.items()}
-    moved = {name: float(np.abs(of.u_mm - shear["mesh"].u_mm).max()) for name, of in shear.items() if name != "mesh"}
-    assert 0.0 < min(moved.values()) < max(moved.values()) < 2.0, moved
+    for load, missing in (("Load2", set()), ("Load3", {"tape"})):
+        shear = {
+            n: read_result(n, one.place / f"{load}.vtu").deformation for n, one in found.items() if n not in missing
+        }
+        base = shear.pop("mesh")
+        moved = {name: float(np.abs(of.u_mm - base.u_mm).max()) for name, of in shear.items()}
+        assert 0.0 < min(moved.values()) < max(moved.values()) < 2.0, moved
     written = {name: (one.place / "Load2.vtu").stat().st_mtime_ns for name, one in found.items()}
     # only what changed is solved again, and what is exact by now is gone
     vary(**given, uncertainty=uncertain.model_copy(update={"poisson": 0.4, "direction_deg": 0.0}))
@@ -104,3 +115,30 @@ def test_without_a_coarser_mesh_the_states_of_the_model_itself_are_used(given, t
     (found,) = variant_folders([alone["out"]])
     assert done.complete, done.lines
     assert (found.record.input, found.record.steps, found.base) == ("force", 1.0, None)
+
+
+def test_boundaries_move_as_far_as_their_probabilities_tell_but_the_largest_tissues(given, tmp_path) -> None:
+    base = read_result("base", given["base"] / "Load2.vtu").deformation.mesh
+    depth = {}
+    for name, boundaries_mm in (("told", {"skin": 0.9, "fat": 2.0}), ("least", {"skin": 0.1})):
+        alone = {**given, "coarse": None, "out": tmp_path / name, "boundaries_mm": boundaries_mm}
+        assert vary(**alone, uncertainty=spread(labels_voxels=0.5)).complete
+        found = {one.record.input: one for one in variant_folders([alone["out"]])}
+        assert set(found) == {"labels-bone", "labels-skin"}  # fat is the largest, and meets skin alone
+        meshes = {n: read_result(n, one.place / "Load2.vtu").deformation.mesh for n, one in found.items()}
+        depth[name] = [float(np.abs(mesh.points_mm - base.points_mm).max()) for mesh in meshes.values()]
+    # the bone by half a voxel of 0.8 mm, the skin by no less
+    assert depth == {"told": pytest.approx([0.4, 0.9]), "least": pytest.approx([0.4, 0.4])}
+
+
+@pytest.mark.parametrize(
+    ("loads", "plate"),
+    [(LOADS[1:], {}), (LOADS, {"taped": False}), (LOADS[:1], {"turns": True})],
+)
+def test_tape_is_not_given_where_it_cannot_be(given, tmp_path, loads, plate) -> None:
+    changed = given["plate_options"].model_copy(update=plate)
+    none = {**given, "coarse": None, "out": tmp_path, "plate_options": changed, "base": tmp_path}
+    sliding = [replace(load, shear_n=None) for load in loads] if plate == {"taped": False} else loads
+    done = vary(**{**none, "loads": sliding}, uncertainty=spread(tape=0.25))
+    assert any(line.startswith("tape: not given. It needs a load without shear") for line in done.lines), done.lines
+    assert not list(tmp_path.glob("tape"))

@@ -1,0 +1,35 @@
+"""The standard deviation of a boundary's position, from probabilities whose boundary has a known one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from dvc.images.image import Grid, LabelMap
+from dvc.labelling.boundary_position import position_sd_mm
+from dvc.labelling.tissues import TissueLabels
+
+NAMES = {1: "fat", 2: "muscle", 3: "bone"}
+
+
+@pytest.mark.parametrize("sd_mm", [0.3, 0.6, 1.2])
+def test_a_ball_of_muscle_whose_surface_has_a_known_position_uncertainty(sd_mm: float) -> None:
+    grid = Grid((40, 48, 36), np.array([0.9, 0.8, 1.0]), np.zeros(3))
+    points = grid.points()
+    depth_mm = 9.0 - np.linalg.norm(points - points.reshape(-1, 3).mean(axis=0), axis=-1)
+    muscle = ndtr(depth_mm / sd_mm)
+    bone = np.zeros(grid.shape, dtype=bool)
+    bone[:4] = True  # exact, and its boundary is not one of soft tissues
+    probability = np.stack([np.where(bone, 0.0, 1.0 - muscle), muscle * ~bone, bone])
+    labels = LabelMap(grid, probability.argmax(axis=0) + 1, NAMES)
+    found = position_sd_mm(TissueLabels(labels, probability.astype(np.float32)))
+    assert found == {"fat": pytest.approx(sd_mm, rel=0.08), "muscle": pytest.approx(sd_mm, rel=0.08)}
+
+
+def test_a_boundary_that_is_certain_has_none() -> None:
+    grid = Grid((12, 12, 12), np.ones(3), np.zeros(3))
+    labels = np.ones(grid.shape, dtype=np.int64)
+    labels[6:] = 2
+    certain = np.stack([labels == n for n in NAMES]).astype(np.float32)
+    assert position_sd_mm(TissueLabels(LabelMap(grid, labels, NAMES), certain)) == {"fat": 0.0, "muscle": 0.0}
