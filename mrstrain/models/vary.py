@@ -18,7 +18,6 @@ from dvc.atomic_files import write_whole
 from dvc.errors import MrstrainError
 from dvc.worker import Worker
 from fe import variation
-from fe.mesh_file import BONE, SKIN
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint
 from mrstrain.models.simulate import material_sets, simulate
 from mrstrain.models.variant_files import MESH, VARIANT, VariantRecord
@@ -207,8 +206,8 @@ def _boundaries(
 
     The largest tissue meets the others, so its boundary is theirs.
     """
-    own_mm = {tissue.casefold(): mm for tissue, mm in (boundaries_mm or {SKIN: least_mm}).items()}
-    moving = {BONE: partial(variation.with_bone, thickness_mm=least_mm)}
+    own_mm = {tissue.casefold(): mm for tissue, mm in (boundaries_mm or {fe.SKIN: least_mm}).items()}
+    moving = {fe.BONE: partial(variation.with_bone, thickness_mm=least_mm)}
     largest = max(mesh.regions, key=lambda name: float(np.abs(mesh.volumes_mm3[mesh.regions[name]]).sum()))
     for name in mesh.regions:
         if name.casefold() in own_mm and (name != largest or boundaries_mm is None):
