@@ -16,8 +16,10 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -35,7 +37,7 @@ from dvc import (
     write_labels,
 )
 from dvc.io.result_folder import spline_in
-from fe import read_tet_mesh, write_tet_mesh
+from fe import LoadStep, read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh, run, simulate
 from mrstrain.models.simulate import LOADS
 from mrstrain.records.provenance import versions
@@ -121,8 +123,8 @@ def main() -> None:
     assert not wrong, f"neither the true order nor called noise: {wrong}"
 
 
-def hidden_model(work: Path, labels: LabelMap, seed: int) -> Path:
-    """Mesh the heel, mix its fat, and simulate the loads; the folder of the results."""
+def hidden_model(work: Path, labels: LabelMap, seed: int, **how: Any) -> Path:
+    """Mesh the heel, mix its fat, and simulate the loads, ``how`` being passed to `simulate`; the folder of results."""
     done = work / "simulated" / "hidden"
     if (done / "regions.csv").is_file():  # written when the simulation has ended
         return done
@@ -143,16 +145,18 @@ def hidden_model(work: Path, labels: LabelMap, seed: int) -> Path:
     mixed = TetMesh(plain.points_mm, plain.cells, regions=regions, facets=plain.facets)
     write_tet_mesh(work / "mixed.vtu", mixed, {})
     (work / "hidden.toml").write_text(HIDDEN)
-    told = simulate(work / "mixed.vtu", out=work / "simulated", sets=[str(work / "hidden.toml")])
+    told = simulate(work / "mixed.vtu", out=work / "simulated", sets=[str(work / "hidden.toml")], **how)
     print("\n".join(told.summary()))
     return done
 
 
-def images(work: Path, heel: Heel, labels: LabelMap, hidden: Path, seed: int) -> Path:
+def images(
+    work: Path, heel: Heel, labels: LabelMap, hidden: Path, seed: int, loads: Sequence[LoadStep] = LOADS
+) -> Path:
     """Form the images of the hidden model's loads; the study's folder."""
     study, grid = work / "study", labels.grid
     study.mkdir(exist_ok=True)
-    if not (study / f"{LOADS[-1].name}.nii.gz").is_file():
+    if not (study / f"{loads[-1].name}.nii.gz").is_file():
         write_image(study / "Load0.nii.gz", scan(heel, grid, snr=SNR, number=0))
         foot = random_foot_motion(seed, 100)
         bone = labels.region("bone")
@@ -160,7 +164,7 @@ def images(work: Path, heel: Heel, labels: LabelMap, hidden: Path, seed: int) ->
         write_image(study / "Load0-again.nii.gz", scan(heel, again, None, foot, snr=SNR, number=100))
         write_labels(study / "tissues.nii.gz", labels)
         write_labels(study / "to_mesh.nii.gz", labels_to_mesh(heel, labels))
-        for number, load in enumerate(LOADS, start=1):
+        for number, load in enumerate(loads, start=1):
             moved = as_motion(truth(hidden, load.name, labels), labels)
             foot = random_foot_motion(seed, number)
             where = covering(grid, foot.apply(bone.points()))
