@@ -72,7 +72,8 @@ $(VENV)/installed.stamp: $(VENV)/dependencies.stamp pyproject.toml
 	@echo "Set-up 4 of 5: installing mrstrain"
 	@$(BIN)/python -m pip install $(QUIETLY) --no-deps --no-build-isolation -e .
 	@echo "Set-up 5 of 5: compiling the registration code, and testing it on a tiny image pair"
-	@$(THREADS) $(BIN)/python -c 'from dvc.registration.self_test import self_test; print(self_test())'
+	@$(THREADS) $(BIN)/python -c 'from dvc.registration.self_test import self_test; print("Test passed:", self_test())'
+	@echo "mrstrain is ready: $(BIN)/mrstrain"
 	@touch $@
 
 demo: setup

@@ -9,6 +9,8 @@ masks that are a voxel too large or too small, and wrong ones. Two measures:
   inside the body
 - rim: the median brightness of the outer millimetre of the mask, over that of the rest (cortical bone is dark)
 
+- shift: the sharpest mask that is 2.5 to 12 mm away, over the mask as given
+
 A measure can tell if the values of wrong masks lie outside the range of the right ones.
 """
 
@@ -23,7 +25,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, shift
 
 from dvc import Image, Mask, tissue_mask
-from dvc.registration.bone_mask import edge_sharpness
+from dvc.registration.bone_mask import _FITS, _SHIFTS_MM, _gradient, edge_sharpness, nearest_edges
 from mrstrain.records.provenance import versions
 from phantoms import Heel, heel_grid, labels_of, scan
 
@@ -59,6 +61,12 @@ def rim(image: Image, mask: Mask) -> float:
     return float(np.median(image.values[outer]) / np.median(image.values[inner])) if inner.any() else float("nan")
 
 
+def shifted(image: Image, mask: Mask, body: Mask) -> float:
+    """Sharpness of a mask where it is sharpest, over that as given; 1 if it fits nowhere, or best near its place."""
+    given, best, shift_mm = nearest_edges(_gradient(image), mask, body)
+    return best / given if best >= _FITS and np.linalg.norm(shift_mm) >= _SHIFTS_MM[0] else 1.0
+
+
 def _range(values: list[float]) -> list[float]:
     """The smallest, median and largest of the values that are known; empty without any."""
     known = [value for value in values if not np.isnan(value)]
@@ -75,9 +83,10 @@ def main() -> None:
         image = scan(heel, grid, snr=snr, number=0)
         body = tissue_mask(image)
         for name, mask in masks(labels_of(heel, grid).region("bone"), body, seed).items():
-            values = found.setdefault(name, {"edge": [], "rim": []})
+            values = found.setdefault(name, {"edge": [], "rim": [], "shift": []})
             values["edge"].append(edge_sharpness(image, mask, body))
             values["rim"].append(rim(image, mask))
+            values["shift"].append(shifted(image, mask, body))
     ranges = {name: {measure: _range(values) for measure, values in of.items()} for name, of in found.items()}
     for name, of in ranges.items():
         print(f"{name:24}", *(f"{measure} {' '.join(map(str, known)) or '-'}" for measure, known in of.items()))

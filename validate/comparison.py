@@ -358,7 +358,9 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[Misfit
     if not verdicts:
         return None
     distrust, caution = ([r for v in verdicts if v.level == level for r in v.reasons] for level in LEVELS[:0:-1])
-    registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
+    registrations = {1: "The registration", 2: "Both registrations"}.get(
+        len(verdicts), f"All {len(verdicts)} registrations"
+    )
     sound = f"{registrations} passed all checks. This is a verdict on the measurement; the models are judged below."
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 

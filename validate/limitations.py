@@ -18,7 +18,7 @@ def limitations(loads: Sequence[LoadComparison]) -> list[str]:
             what = "the rigid motion of the bone was not removed from this measurement, so displacements include it."
             notes.append(f"{load}: {what}")
         if gaps := ", ".join(one.case.without_intervals):
-            notes.append(f"{load}: no intervals in {gaps}; the measurement gives the reason.")
+            notes.append(f"{load}: no intervals in {gaps}; the report of the measurement says why.")
         if error is not None and np.isnan(error.widening):
             what = "the error model is from one motion of one subject, so the coverage of its intervals is unknown."
             notes.append(f"{load}: {what}")

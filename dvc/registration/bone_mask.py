@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
+from scipy import fft
 from scipy.ndimage import distance_transform_edt
 
-from dvc.arrays import BoolArray, Float32Array
+from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.images.filters import gaussian
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
@@ -24,6 +25,11 @@ _FOLLOWS = 1.2  # right masks of heels have 2.0 and more, those a voxel off 1.6 
 _LIES = 1.3  # a right mask that was mirrored has more where it belongs
 _THICKEST_MM = 2.5  # across thicker slices, an edge is as wide as what it is compared with
 _FROM_AIR_MM = 3.0
+_SHIFTS_MM = 2.5, 12.0  # shifts that are looked for; masks a voxel too large or small fit best up to 1.8 mm away
+_SHIFTED = 1.25  # times the sharpness of the mask as given: right masks have at most 1.03, those 3 mm off 1.28 and more
+_FITS = 1.5  # right masks have 1.74 and more where they belong, masks 3 mm too large at most 1.27 anywhere
+_STRONG = 0.95  # quantile of the gradient, above which all edges count alike
+_SEEN = 0.5  # of the surface away from air
 _MORE = 1.02  # times the sharpest of those about the image's middle, one of which it is where the origin lies there
 _LEAST, _MOSTLY = 500, 0.5  # voxels of the mask, and the fraction of them that lies on the image in the other frame
 _TO_THE_OTHER = np.array([-1.0, -1.0, 1.0])
@@ -40,6 +46,7 @@ def mask_doubt(image: Image, bone: Mask, body: Mask) -> str:
     """
     gradient = _gradient(image)
     follows = _inner_sharpness(gradient, bone, body)
+    moved = _shifted(*nearest_edges(gradient, bone, body))
     i, j, k = (slice(_ENDS, n - _ENDS) for n in image.grid.shape)
     gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
     if not bone.inside.any() or bone.inside.all():
@@ -55,7 +62,8 @@ def mask_doubt(image: Image, bone: Mask, body: Mask) -> str:
             found["with the signs of L and P reversed"] = sharpness
     best = max(found, key=lambda how: np.nan_to_num(found[how]))
     if not found[best] > max(_BETTER * own, _LIES):
-        return _edgeless(follows) if follows < _FOLLOWS and image.grid.spacing_mm.max() <= _THICKEST_MM else ""
+        edgeless = follows < _FOLLOWS and image.grid.spacing_mm.max() <= _THICKEST_MM
+        return moved or (_edgeless(follows) if edgeless else "")
     return (
         f"The bone mask may be mirrored or in another frame (RAS for LPS): {best}, its surface would follow the edges "
         f"of the unloaded image better (sharpness {found[best]:.2f} instead of {own:.2f}). Check it on the unloaded "
@@ -69,6 +77,54 @@ def _edgeless(sharpness: float) -> str:
         f"{sharpness:.2f}; use with care below {_FOLLOWS:g}). The mask may be shifted, too large, or not that of a "
         "bone. Check it on the unloaded image."
     )
+
+
+def _shifted(given: float, best: float, shift_mm: FloatArray) -> str:
+    if best < max(_FITS, _SHIFTED * given) or np.linalg.norm(shift_mm) < _SHIFTS_MM[0]:
+        return ""
+    along = ", ".join(f"{step + 0.0:.1f}" for step in np.round(shift_mm, 1))
+    return (
+        f"The bone mask may be off: moved by {np.linalg.norm(shift_mm):.0f} mm (LPS: {along}), its surface would "
+        f"follow the edges of the unloaded image better (sharpness {best:.2f} instead of {given:.2f}). Check it on the "
+        "unloaded image."
+    )
+
+
+def nearest_edges(gradient: Float32Array, bone: Mask, body: Mask) -> tuple[float, float, FloatArray]:
+    """Sharpness of a mask as given, that of the same mask where it is sharpest, and the shift to there (3,), LPS mm.
+
+    Shifts of up to 12 mm are compared. Here the sharpness is a ratio of means of the image's gradient (ni, nj, nk),
+    strong edges counting alike, more than 3 mm inside the body. The sums for all shifts are one convolution.
+    """
+    grid, edges = bone.grid, bone.grid.spacing_mm
+    if not bone.inside.any():
+        return float("nan"), float("nan"), np.zeros(3)
+    box = bone.box(int(np.ceil((_NEAR_MM[1] + _SHIFTS_MM[1]) / edges.min())) + 1)
+    tissue = (body.inside | bone.inside)[box]
+    deep = tissue if tissue.all() else distance_transform_edt(tissue, edges) > _FROM_AIR_MM
+    if not deep.any():
+        return float("nan"), float("nan"), np.zeros(3)
+    values = gradient[box]
+    values = np.where(deep, np.minimum(values, np.quantile(values[deep], _STRONG)), 0.0).astype(np.float32)
+    at, near = _surface(bone.inside[box], edges)
+    room = [
+        fft.next_fast_len(n + int(np.ceil(_SHIFTS_MM[1] / e)), real=True) for n, e in zip(at.shape, edges, strict=True)
+    ]
+
+    def transformed(array: Float32Array | BoolArray) -> FloatArray:
+        return np.asarray(fft.rfftn(array.astype(np.float32), room))
+
+    seen = [transformed(values), transformed(deep)]
+    sums = [[fft.irfftn(of * np.conj(transformed(where)), room) for of in seen] for where in (at, near)]
+    (strength, count), (beside, others) = sums
+    steps = np.meshgrid(*(fft.fftfreq(n, 1.0 / n) * e for n, e in zip(room, edges, strict=True)), indexing="ij")
+    enough = (count > _SEEN * np.count_nonzero(at & deep)) & (others > 0.5) & (beside > 0.0)
+    enough &= np.sqrt(np.sum(np.square(steps), axis=0)) <= _SHIFTS_MM[1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sharpness = np.where(enough, strength / count * others / beside, 0.0)
+    best = np.unravel_index(np.argmax(sharpness), sharpness.shape)
+    shift = grid.direction @ [float(along[best]) for along in steps]
+    return float(sharpness[0, 0, 0]), float(sharpness[best]), np.asarray(shift)
 
 
 def edge_sharpness(image: Image, bone: Mask, body: Mask) -> float:
@@ -122,12 +178,16 @@ def _sharpness(bone: Mask, gradients: Sequence[Float32Array], where: BoolArray |
     """Sharpness of a mask on images of such gradients, on its grid; ``where`` voxels count."""
     edges = bone.grid.spacing_mm
     box = bone.box(int(np.ceil(_NEAR_MM[1] / edges.min())) + 1)
-    inside = bone.inside[box]
-    depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
-    at, near = depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
+    at, near = _surface(bone.inside[box], edges)
     if where is not None:
         at, near = at & where[box], near & where[box]
     return [_contrast(gradient[box], at, near) for gradient in gradients]
+
+
+def _surface(inside: BoolArray, edges: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Voxels at the surface of a mask, and those that it is compared with."""
+    depth = distance_transform_edt(inside, edges) + distance_transform_edt(~inside, edges) - 0.5 * edges.min()
+    return depth <= _EDGE * edges.max(), (depth > _NEAR_MM[0]) & (depth <= _NEAR_MM[1])
 
 
 def _contrast(gradient: Float32Array, at: BoolArray, near: BoolArray) -> float:

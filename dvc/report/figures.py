@@ -35,7 +35,7 @@ _COLOURS = {  # what is drawn with its unit, and the name of its colour map
     "jacobian": ("volume ratio det F, no unit", "PuOr_r"),
 }  # fmt: skip
 _ENDS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-_STAGES = ("After the rigid alignment", "After the whole registration")
+_STAGES = ("Before: rigidly aligned", "After: registered")
 _CHECK_MM = 12.0
 _LINE_MM = 5.0
 _HIGHEST_SHEAR = 0.6

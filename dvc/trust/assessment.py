@@ -78,6 +78,7 @@ def assess(
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
     plate_normal: FloatArray | None = None,
+    pressed: bool = True,
 ) -> Quality:
     """Assess a registration by its strain maps, the similarity of the images, and further evidence.
 
@@ -102,6 +103,8 @@ def assess(
     plate_normal : (3,), optional
         Unit direction, LPS, from the body to a plate that presses on it: the tissue between it and the bone must move
         towards the bone.
+    pressed : bool
+        Whether a plate is known to press there; otherwise only a larger displacement counts, of images.
 
     Returns
     -------
@@ -144,8 +147,8 @@ def assess(
     findings += _judged("landmark_error_mm", quality.landmarks["median_mm"])
     if floor is not None:
         findings += _judged("floor_shear_p95", floor.max_shear_p95)
-    if bone is not None and plate_normal is not None:
-        findings += moves_away(displacement_along_normal(maps, tissue, bone, plate_normal))
+    if bone is not None and plate_normal is not None and (pressed or similarity is not None):
+        findings += moves_away(displacement_along_normal(maps, tissue, bone, plate_normal), known=pressed)
     return replace(quality, verdict=together(findings))
 
 

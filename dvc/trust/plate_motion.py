@@ -9,7 +9,7 @@ from dvc.images.image import Mask
 from dvc.trust.verdict import Verdict
 
 _CELL_MM, _LAYER_MM = 3.0, 3.0
-_MOST_MM = 0.5
+_MOST_MM, _MOST_UNKNOWN_MM = 0.5, 1.0  # where a plate is known to press, and where it may press elsewhere
 
 
 def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, normal: FloatArray) -> float:
@@ -53,13 +53,24 @@ def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, normal
     return float(along[outer].mean()) if outer.any() else float("nan")
 
 
-def moves_away(displacement_mm: float) -> list[Verdict]:
-    """A finding where the tissue under the bone moves towards the plate; none otherwise, or for NaN."""
-    if not displacement_mm > _MOST_MM:
+def moves_away(displacement_mm: float, *, known: bool = True) -> list[Verdict]:
+    """A finding where the tissue under the bone moves away from it; none otherwise, or for NaN.
+
+    ``known`` tells whether a plate is known to press there.
+    """
+    limit = _MOST_MM if known else _MOST_UNKNOWN_MM
+    if not displacement_mm > limit:
         return []
-    told = (
-        f"Tissue under the bone moves away from it, by {displacement_mm:.1f} mm on average along the plate normal "
-        f"(limit: 'Use with care' above {_MOST_MM:g} mm); a plate presses it towards the bone. Check that the "
-        "unloaded and the loaded image are not swapped, and that plate_normal points away from the body."
-    )
+    if known:
+        told = (
+            f"Tissue under the bone moves away from it, by {displacement_mm:.1f} mm on average along the plate normal "
+            f"(limit: 'Use with care' above {limit:g} mm); a plate presses it towards the bone. Check that the "
+            "unloaded and the loaded image are not swapped, and that plate_normal points away from the body."
+        )
+    else:
+        told = (
+            f"Tissue below the bone (inferior) moves away from it, by {displacement_mm:.1f} mm on average (limit: 'Use "
+            f"with care' above {limit:g} mm). Check that the unloaded and the loaded image are not swapped. If the "
+            "tissue was pressed from another side, give the direction to the plate (plate_normal)."
+        )
     return [Verdict("caution", (told,))]

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import typer
 
 from dvc.images.bone_names import is_bones_name
-from mrstrain.studies.init import Answers, StudyInputs
+from mrstrain.studies.init import Answers, StudyInputs, force_named
 
 Read = Callable[[str], str]
 _T = TypeVar("_T")
@@ -28,7 +28,9 @@ def ask(inputs: StudyInputs, names: Sequence[str], picture: Path | str, *, read:
         forces: dict[str, tuple[float, float]] = {}
         given["forces"] = forces
         for load in inputs.loads:
-            pressed = _asked(f"{load}: normal force, N", "later", _force, read)
+            named = force_named(load)
+            usual_n = "later" if named is None else f"{named:g}"
+            pressed = _asked(f"{load}: normal force, N", usual_n, _force, read) or named
             if pressed is not None:
                 forces[load] = pressed, _asked(f"{load}: shear force, N", "0", _number, read) or 0.0
         if inputs.loads:

@@ -75,9 +75,12 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     told += "." if high.interval is None else ", with 95 % intervals in brackets."
     overlapping = [str(row[1]) for other, row in known if row[0] == load and row[1] != tissue and other.reaches(high)]
     if overlapping and high.interval is not None:
-        told += f" It may be as large in {' and '.join(overlapping)}, as the intervals overlap."
+        *others, last = overlapping
+        listed = f"{', '.join(others)} and {last}" if others else last
+        told += f" It may be as large in {listed}, since the intervals overlap."
     if beside.floor is not None:
-        told += f" The noise floor is {beside.floor.max_shear_p50:.3f} and {beside.floor.max_shear_p95:.3f}."
+        noise = f"{beside.floor.max_shear_p50:.3f} (median) and {beside.floor.max_shear_p95:.3f} (95th percentile)"
+        told += f" The noise floor is {noise}."
     return told
 
 

@@ -28,7 +28,10 @@ from mrstrain.records.provenance import file_hash
 
 _log = logging.getLogger(__name__)
 _LOCK = ".mrstrain-lock"
-_UNLOADED = re.compile(r"load[ _-]?0(?![.\d]*\d)|unloaded|(?<![a-z])no[ _-]?load|baseline", re.IGNORECASE)
+_UNLOADED = re.compile(
+    r"load[ _-]?0(?![.\d]*\d)|unloaded|(?<![a-z])no[ _-]?load|baseline|(?<![a-z])rest(?![a-z])"
+    r"|(?<![a-z\d.])0n(?![a-z\d])", re.IGNORECASE
+)  # fmt: skip
 _NAMES_BESIDE = (
     "%s: the labels have no names. There is a table of names beside it, %s; to use it, give it as names (--names %s on "
     "the command line)."
@@ -137,7 +140,7 @@ def matrix_of(rows: object, where: str) -> FloatArray:
 
 
 def named_unloaded(name: str) -> bool:
-    """Whether an image is named like the unloaded one: Load0, heel_unloaded, baseline."""
+    """Whether an image is named like the unloaded one: Load0, heel_unloaded, heel_rest, baseline, heel_0N."""
     return _UNLOADED.search(image_stem(name)) is not None
 
 

@@ -17,9 +17,9 @@ _AREAS = "Areas of all models and loads"
 _NEAREST = (
     " Best match: the model with the smallest area between its strain-volume curve and the measured one ({range}) in "
     "that tissue alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, "
-    "so another model may be best. In brackets: other models that are better than no deformation and may be as good, "
-    "since their 95 % intervals overlap with that of the best match, or are not known; no significance test is made "
-    "for a single tissue. None: no model is better than no deformation. A dash: hardly any of this tissue is strained"
+    "so another model may be best. In brackets: other models that may be as good, since their 95 % intervals overlap "
+    "with that of the best match, or are not known; no significance test is made for a single tissue. All of them have "
+    "an area at least 5 % smaller than no deformation; none: no model has. A dash: hardly any of the tissue is strained"
     " (less than 1 % above {low:g}), so its areas are not informative. If that holds for a whole load, a sentence "
     "above tells how many times the measured strain each model predicts."
 )
@@ -51,6 +51,9 @@ def answer_of(
     return [first, *areas]
 
 
+_CLOSER = 0.95  # of the area without deformation
+
+
 def _comparison(folder: Path) -> Comparison | None:
     try:
         return Comparison.read(folder)
@@ -68,7 +71,7 @@ def _nearest(comparison: Comparison) -> Mapping[tuple[str, str], str]:
         if above < STRAINED * whole:
             continue
         areas = [a for a in comparison.areas if (a.load, a.tissue) == (curve.load, curve.tissue) and not a.levelled]
-        limit = next((a.best_ml for a in areas if a.model == NOTHING), np.inf)
+        limit = _CLOSER * next((a.best_ml for a in areas if a.model == NOTHING), np.inf)
         better = sorted((a for a in areas if a.best_ml < limit), key=lambda a: a.best_ml)
         near = [other.model for other in better[1:] if not other.low_ml > better[0].high_ml]  # or not known
         best = better[0].model if better else "none"

@@ -17,13 +17,13 @@ from dvc.io.images.dicom import is_dicom, is_multiframe
 from fe import BONE, published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.simulate import LOADS
-from mrstrain.options.modelling import Directions
+from mrstrain.options.modelling import Directions, Meshing
 from mrstrain.records.inputs import IMAGE_ENDINGS, TABLE_ENDINGS, image_stem, named_unloaded
 from mrstrain.studies.file import FILE
 
 _AGAIN = re.compile(r"again|repeat|rescan|retest", re.IGNORECASE)
 _LOADED = re.compile(
-    r"load[ _-]?[1-9]\d*|loaded|(?<![a-z\d.])[1-9]\d+(\.\d+)?n(?![a-z\d])", re.IGNORECASE
+    r"load[ _-]?[1-9]\d*|loaded|(?<![a-z\d.])(?P<force>[1-9]\d+(\.\d+)?)n(?![a-z\d])", re.IGNORECASE
 )  # Load1, 140N
 _LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
 _ONE_BONE = re.compile(r"(.*[ _-])?(calcaneus|calcaneum|bone)[ _-]*seg(mentation)?", re.IGNORECASE)
@@ -38,11 +38,13 @@ _ROLES = {
 }  # fmt: skip
 _NO_ROLE = "because its name does not indicate a role"
 _NAMES = (
-    "Recognised names: Load0 or NAME_unloaded, Load1 or NAME_loaded or NAME_140N, NAME_bone, NAME_labels, Load0-again. "
+    "Recognised names: Load0, NAME_unloaded or NAME_rest; Load1, NAME_loaded or NAME_140N; NAME_bone; NAME_labels; "
+    "Load0-again. "
     "Rename the files, delete study.toml, and run mrstrain init again."
 )
 _SLICES = "A DICOM series belongs in a folder of its own, such as Load1; then delete study.toml, and run init again."
 _LOOKED_AT = 20
+_EDGE_OF_A_BODY_MM = 4.0  # where the whole body that the image shows is meshed
 PICTURE = "study.png"
 _TO_FILL_IN = "# FILL IN"  # of lines in the template
 
@@ -73,6 +75,12 @@ class Answers:
     forces: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # normal and shear, by load
     normal: tuple[float, float, float] = Directions().plate_normal  # of the plate, outward
     shear_direction: tuple[float, float, float] = Directions().shear_direction
+
+
+def force_named(load: str) -> float | None:
+    """Normal force, N, in the name of a load, such as heel_140N; None if there is none."""
+    forces = [match["force"] for match in _LOADED.finditer(load) if match["force"]]
+    return float(forces[0]) if len(forces) == 1 else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +177,9 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
     bones = _bones(place, found, names, answers.bone or BONE)
     mask = answers.bone_mask or (None if answers.bone else found.bone_mask)
     auto = found.labels is None and mask is not None
+    named = {load: force for load in found.loads if (force := force_named(load)) is not None}
     told = {"found": found, "name": name, "answers": answers, "forces": forces, "sets": sets, "bones": bones}
+    told |= {"named": named, "edge_mm": _EDGE_OF_A_BODY_MM if auto else Meshing().edge_mm}
     write_whole(target, template.render(told | {"mask": mask, "auto": auto}))
     return NewStudy(target, found, picture, auto)
 

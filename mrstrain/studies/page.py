@@ -176,7 +176,9 @@ def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdic
     verdict = worst([*verdicts, *inputs])
     if verdict.reasons:
         return verdict
-    registrations = "The registration" if len(verdicts) == 1 else f"All {len(verdicts)} registrations"
+    registrations = {1: "The registration", 2: "Both registrations"}.get(
+        len(verdicts), f"All {len(verdicts)} registrations"
+    )
     models = " This is a verdict on the measurement; the models are judged below." if compared else ""
     return replace(verdict, reasons=(f"{registrations} passed all checks.{models}",))
 

@@ -47,7 +47,8 @@ class PhantomFiles:
         loads = " ".join(as_typed(path) for name, path in self.images.items() if name in LOADS)
         return [
             f"Images: {', '.join(path.name for path in self.images.values())}; truth: {at / TRUTH}",
-            f"To register them: mrstrain register {as_typed(self.images['Load0'])} {loads} "
+            "To register them:",
+            f"mrstrain register {as_typed(self.images['Load0'])} {loads} "
             f"--bone {as_typed(at / 'calcaneus.nii.gz')} --labels {as_typed(at / 'tissues.nii.gz')} "
             f"--names {as_typed(at / 'tissues.csv')} --repeat {as_typed(self.images[_AGAIN])} "
             f"--out {as_typed(at / 'results')}",

@@ -66,7 +66,8 @@ def twin(
     lines = (
         f"Warped image: {target / _IMAGE}; it shows {100 * made.shown:.0f} % of the tissue. Truth: {target / _TRUTH}",
         f"True {measured.strain_line}",
-        f"To register it: mrstrain register {as_typed(load0)} {as_typed(target / _IMAGE)} {told}{align} "
+        "To register it:",
+        f"mrstrain register {as_typed(load0)} {as_typed(target / _IMAGE)} {told}{align} "
         f"--out {as_typed(target / 'results')}",
     )
     return Outcome(target, lines)

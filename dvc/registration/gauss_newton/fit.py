@@ -43,6 +43,8 @@ USUAL_VOLUME = 300.0
 # Where the images ask for a change of volume, its gradient is held instead: while it is looked for with this weight
 # over how sharply a displacement is seen (mm4), so that large voxels and small ones are judged alike; then with 1/mm.
 _LOOKING_MM4, _FREED = 1000.0, 100.0
+# Of voxels, mm and mm3. In larger ones, loads look like swelling (2 mm: .077 and .068 of what `volume_asked` gives).
+_LONGEST_EDGE, _LARGEST = 2.5, 6.0
 _RATIO = np.sqrt(10.0)
 _POWERS = -4, 3  # powers of the ratio that are tried at the most: weights of 0.03 to 95
 _MIDDLE = 0.7  # of each edge of the mask's box
@@ -103,7 +105,9 @@ def fit(
     core = np.zeros(pair.body.grid.shape, dtype=bool)
     if pair.bone is not None:
         core = distance_transform_edt(pair.bone.inside, sampling=pair.bone.grid.spacing_mm) > _RIM_MM
-    weights, choice = parameters.weights, Choice(parameters.weights, "fixed beforehand")
+    coarse = fixed.grid.spacing_mm.max() > _LONGEST_EDGE or fixed.grid.voxel_volume_mm3 > _LARGEST
+    weights = parameters.weights
+    choice = Choice(weights, "fixed beforehand", coarse=bool(coarse and parameters.volume is None))
     spacing = np.maximum(parameters.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
     axes, soft = np.array(fixed.grid.direction), pair.body.inside & ~core
     guess = start
@@ -116,7 +120,7 @@ def fit(
         level = _level(pictures, inside, soft, core, control, sigma_mm, rest)
         patience = weights.patience
         coefficients = level.descend(coefficients, weights, steps=steps * patience, stop_mm=stop_mm).coefficients
-        if parameters.volume is None and number == len(LEVELS) - 2:
+        if parameters.volume is None and number == len(LEVELS) - 2 and not choice.coarse:
             usual = replace(weights, bending=USUAL_BENDING)
             choice = replace(choice, asked=level.volume_asked(coefficients, usual, _LOOKING_MM4))
             if choice.frees_volume:
@@ -130,7 +134,7 @@ def fit(
         margins = [int(0.5 * (1.0 - _MIDDLE) * (edge.stop - edge.start)) for edge in box]
         part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
         middle = Level(pictures, inside & part, soft & part, core & part, level.roughness, rest=rest)
-        choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
+        choice = replace(choose(middle, coefficients, weights), asked=choice.asked, coarse=choice.coarse)
         del middle  # its memory goes to the last steps
         progress(_DONE[-1])
     steps = _LAST_STEPS * choice.weights.patience

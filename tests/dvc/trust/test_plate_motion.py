@@ -56,9 +56,9 @@ def test_a_plate_from_another_side_sees_another_surface() -> None:
 
 
 def test_a_loaded_image_taken_for_the_unloaded_one_is_used_with_care() -> None:
-    def level_and_reasons(by: float, normal: np.ndarray | None) -> tuple[str, str]:
+    def level_and_reasons(by: float, normal: np.ndarray | None, **given: object) -> tuple[str, str]:
         quality = assess(strain_maps(pressed(by), WHOLE), WHOLE, bone(), similarity=ALIKE, in_bone=(0.0, 0.0),
-                         plate_normal=normal)  # fmt: skip
+                         plate_normal=normal, **given)  # fmt: skip
         return quality.verdict.level, " ".join(quality.verdict.reasons)
 
     level, reasons = level_and_reasons(-0.1, INFERIOR)
@@ -66,7 +66,14 @@ def test_a_loaded_image_taken_for_the_unloaded_one_is_used_with_care() -> None:
     assert "moves away from it, by 2.2 mm" in reasons
     assert "swapped" in reasons
     assert level_and_reasons(0.1, INFERIOR) == level_and_reasons(-0.02, INFERIOR) == ("trust", "")
-    assert level_and_reasons(-0.1, None) == ("trust", "")  # it is not known that a plate presses
+    assert level_and_reasons(-0.1, None) == ("trust", "")
+    # where it is not known that a plate presses, the one that is assumed must be clearly contradicted
+    level, reasons = level_and_reasons(-0.1, INFERIOR, pressed=False)
+    assert level == "caution"
+    assert "below the bone (inferior) moves away from it, by 2.2 mm" in reasons
+    assert "pressed from another side, give the direction to the plate" in reasons
+    assert level_and_reasons(-0.04, INFERIOR)[0] == "caution"
+    assert level_and_reasons(-0.04, INFERIOR, pressed=False) == ("trust", "")
 
 
 def test_a_measurement_is_judged_by_the_normal_alone() -> None:

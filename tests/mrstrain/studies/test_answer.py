@@ -66,6 +66,7 @@ def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_
         Area("far", "Load1", "fat", 3.0, 0.3, 3.0, 2.5, 3.5, 0.1),
         Area("second", "Load1", "fat", 1.2, 0.1, 1.2, 1.1, 1.7, 0.1),
         Area("worse than nothing", "Load1", "fat", 1.4, 0.1, 1.4, 1.1, 1.7, 0.1),
+        Area("hardly better than nothing", "Load1", "fat", 1.25, 0.1, 1.25, 1.1, 1.7, 0.1),
         Area("best", "Load1", "fat", 1.0, 0.1, 1.0, 0.8, 1.2, 0.1),
         Area(NOTHING, "Load1", "fat", 1.3, 0.1, 1.3, 1.1, 1.7, 0.1),
         Area("best", "Load2", "fat", 0.1, 0.1, 0.1, 0.0, 0.2, 0.1),
@@ -106,8 +107,8 @@ def test_the_most_strained_tissue_is_surely_so() -> None:
 
     assert most_strained(Table("Measured", columns, rows), beside) == (
         "Maximum shear strain in fat, the most strained tissue, under Load1 (140 N): median 0.300 (0.200 to 0.400), "
-        "95th percentile 0.419 (0.400 to 0.500), with 95 % intervals in brackets. It may be as large in muscle, as the "
-        "intervals overlap. The noise floor is 0.011 and 0.029."
+        "95th percentile 0.419 (0.400 to 0.500), with 95 % intervals in brackets. It may be as large in muscle, since "
+        "the intervals overlap. The noise floor is 0.011 (median) and 0.029 (95th percentile)."
     )
     below_zero = ("Load2", "tendon", fat[0], Estimate(0.5, (-0.45, 0.759)))
     assert "in fat, the most" in most_strained(Table("Measured", columns, (rows[1], below_zero)))

@@ -66,6 +66,18 @@ def test_names_that_a_laboratory_gives_are_recognised(tmp_path):
     assert (found.labels, found.bone_mask, found.unused) == (None, "calcaneus_seg.nii.gz", {})
 
 
+def test_the_force_in_the_name_of_an_image_is_that_of_the_load(tmp_path):
+    made = init(
+        folder_of(tmp_path, "sub07_rest.nii.gz", "sub07_115N.nii.gz", "sub07_62.5N.nii.gz", "sub07_bone.nii.gz")
+    )
+    assert (made.inputs.load0, made.inputs.unused) == ("sub07_rest.nii.gz", {})
+    written = tomllib.loads(made.path.read_text())
+    assert {name: load["normal_n"] for name, load in written["loads"].items()} == {
+        "sub07_115N": 115.0, "sub07_62.5N": 62.5
+    }  # fmt: skip
+    assert written["mesh"]["edge_mm"] == 4.0  # of the whole body, which the label map of the study will hold
+
+
 def test_names_that_would_be_recognised_are_listed_beside_those_that_are_not(tmp_path):
     told = init(folder_of(tmp_path, "Load0.nii.gz", "pressed.nii.gz")).summary()
     assert "NAME_140N" in next(line for line in told if line.startswith("Recognised names: "))
