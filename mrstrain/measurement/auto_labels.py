@@ -16,6 +16,7 @@ from mrstrain.options.measurement import MADE_LABELS, Marks, RegistrationOptions
 from mrstrain.records.durations import TISSUES
 from mrstrain.records.inputs import made_labels
 
+_FINE_MM = 1.5  # in voxels of 1.2 x 1.2 x 2.4 mm, labels do not lower the error
 NEXT_STEP = (
     "Next step: if fat is bright in the unloaded image, add --labels auto, or labels='auto' to mrstrain.register, "
     "which makes a label map from it. On phantom heels (0.8 mm voxels, exact bone mask), this lowers the error of the "
@@ -100,10 +101,13 @@ def _marked_bone(strokes: Marks, named: str | None) -> str:
 
 
 def next_step(
-    files: SubjectFiles, cases: Sequence[str], scans: Scans, how: RegistrationOptions, engine: Engine
+    files: SubjectFiles, cases: Sequence[str], scans: Scans, how: RegistrationOptions, engine: Engine, edge_mm: float
 ) -> str | None:
-    """What to tell somebody who registers without a label map where one could be made and would lower the error."""
-    if files.labels is not None or how.borders is False or engine.family != GAUSS_NEWTON:
+    """What to tell somebody who registers without a label map where one could be made and would lower the error.
+
+    ``edge_mm`` is the longest edge of the unloaded image's voxels.
+    """
+    if files.labels is not None or how.borders is False or engine.family != GAUSS_NEWTON or edge_mm > _FINE_MM:
         return None
     try:
         check_auto(files, Marks(), cases, scans)

@@ -174,7 +174,8 @@ def register(
     finished = tuple(replace(case, section=section) for case, section in zip(finished, alike, strict=True))
     shown = [case for case in finished if case.name != REPEAT]
     answer = measured_strain([c.section for c in shown], subject, {c.name: c.folder for c in shown}, target)
-    advice = next_step(subject_files, cases, scans, registration, chosen)
+    edge_mm = float(subject.reference.grid.spacing_mm.max())
+    advice = next_step(subject_files, cases, scans, registration, chosen, edge_mm)
     series = Series.of(target, finished, run.failures, run.record, answer, of_labels, advice=advice)
     tell(REPORT, WRITING, 1.0)
     return series

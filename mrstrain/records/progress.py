@@ -243,22 +243,26 @@ def _lines(command_began: float) -> OnProgress:
 
 
 def _lines_of_all() -> OnProgress:
-    """Print a line for each part that has ended, with how far all are, and a line of all every minute between."""
+    """Print a line for each part that has ended, with how far all are; every minute between, one with what runs."""
     began = printed_at = time.monotonic()
-    found = list[str]()
+    found, running = list[str](), dict[str, float]()
 
     def progress(case: str, stage: str, fraction: float) -> None:
         nonlocal printed_at
         now = time.monotonic()
         if case != ALL:
             found.extend([f"{case}: {stage}"] if fraction >= 1.0 else [])
+            running.pop(case, None)
+            running.update({case: fraction} if fraction < 1.0 else {})
         elif found or fraction >= 1.0 or now - printed_at >= _LINE_OF_ALL_EVERY_S:
             printed_at = now
             time_left, spent = _left(now - began, fraction), duration(now - began)
             left = f", {time_left}" if time_left not in ("", _NONE_LEFT) and not _COUNTED.fullmatch(stage) else ""
             after = f"{stage} after {spent}{left}"
             ended = [f"finished after {spent}: {stage}"] if fraction >= 1.0 else []
-            told = [f"{line} ({after})" for line in found] or ([] if ended else [f"progress: {after}"])
+            under_way = ", ".join(f"{name} {100 * _short_of_all(share):.0f} %" for name, share in running.items())
+            of_all = f"progress: {after}" + f"; running: {under_way}" * bool(running)
+            told = [f"{line} ({after})" for line in found] or ([] if ended else [of_all])
             for line in (*told, *ended):
                 print(line, file=sys.stderr, flush=True)
             found.clear()

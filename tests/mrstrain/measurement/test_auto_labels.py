@@ -48,8 +48,9 @@ QUICK = {"bending": 3.0, "volume": 300.0}
 def test_nobody_is_told_of_labels_that_cannot_be_made_or_would_not_help(
     files: SubjectFiles, scans: Scans, how: RegistrationOptions, engine: Engine, cases: tuple[str, ...]
 ) -> None:
-    assert next_step(BONE, ("Load1",), Scans(), RegistrationOptions(), GaussNewton()) == NEXT_STEP
-    assert next_step(files, cases, scans, how, engine) is None
+    assert next_step(BONE, ("Load1",), Scans(), RegistrationOptions(), GaussNewton(), 0.8) == NEXT_STEP
+    assert next_step(BONE, ("Load1",), Scans(), RegistrationOptions(), GaussNewton(), 2.4) is None
+    assert next_step(files, cases, scans, how, engine, 0.8) is None
 
 
 @pytest.fixture
@@ -72,8 +73,11 @@ def strokes(tiny_pair, place: Path, **centres: str) -> Path:
     return place
 
 
-def test_a_series_without_labels_ends_with_the_next_step(images, tmp_path: Path, in_this_process) -> None:
+def test_a_series_without_labels_ends_with_the_next_step(
+    images, tmp_path: Path, in_this_process, monkeypatch: pytest.MonkeyPatch
+) -> None:
     load0, load1, bone = images
+    monkeypatch.setattr("mrstrain.measurement.auto_labels._FINE_MM", 2.5)  # than the voxels of the pair
     summary = register(load0, [load1], out=tmp_path / "out", bone=bone, **QUICK).summary()
     assert summary[-2:] == [NEXT_STEP, f"Report: {tmp_path / 'out' / 'report.html'}"]
     assert f"<p>{NEXT_STEP}</p>" in html.unescape((tmp_path / "out" / "report.html").read_text())

@@ -164,8 +164,8 @@ def test_of_many_stages_a_pipe_gets_a_line_for_each_that_ended_with_the_time_lef
     lines = capsys.readouterr()
     assert lines.out == ""
     assert lines.err.splitlines() == [
-        "progress: 0 of 40 stages after 60 s, about 3 min left",
-        "progress: 0 of 40 stages after 2 min, about 2 min left",
+        "progress: 0 of 40 stages after 60 s, about 3 min left; running: Ada: register Load1 30 %",
+        "progress: 0 of 40 stages after 2 min, about 2 min left; running: Ada: register Load1 60 %",
         "Ada: register Load1: max. shear in fat 0.131 median; Trust (1 of 40 stages after 2 min, about 2 min left)",
         "Ben: mesh: 35,000 tetrahedra (40 of 40 stages after 3 min)",
         "finished after 3 min: 40 of 40 stages",
