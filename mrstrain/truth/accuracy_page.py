@@ -52,9 +52,9 @@ HOW_TO_READ = Section(
         "Motions: still (rigid foot motion only), smooth (a smooth flow), sliding (the fat pad slides between "
         "constrained bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as "
         "strong as under the forces of the published experiment), attached-Load1 and attached-Load3 (tissue attached "
-        "to bone, where its strain is largest), wave-L (shear that varies as a cosine of wavelength L mm). Labels +1 "
-        "or -1: bones and skin are one voxel too large, or too small, in the label map or bone mask that the "
-        "registration was given.",
+        "to bone, where its strain is largest), wave-L (shear that varies as a cosine of wavelength L mm). Labels 1 "
+        "voxel too large or too small: bones and skin are so in the label map that the registration was given, or the "
+        "bone in its mask.",
         "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. A finer resolution "
         "means more noise, so report both.",
         "Bias and SD in the error model are conditional on the measured shear. They apply to tissue strained and "
@@ -65,9 +65,12 @@ HOW_TO_READ = Section(
 
 def sections_of(
     errors: Sequence[ErrorRow], floors: Sequence[FloorRow], resolution: Sequence[ResolutionRow],
-    coverage: Sequence[CoverageRow], failures: Mapping[str, str], folder: Path,
+    coverage: Sequence[CoverageRow], failures: Mapping[str, str], folder: Path, *, doubts: Sequence[str] = (),
 ) -> list[Section]:  # fmt: skip
-    """Sections of the page: the answer, then all else, folded. Their figures are written to a folder."""
+    """Sections of the page: the answer, then all else, folded. Their figures are written to a folder.
+
+    ``doubts`` are sentences on the error models, which stand with their validation.
+    """
     by_condition = {of[0].condition: of for of, _ in _by_condition(errors, floors)}
     pictures = {condition: _pictures(condition, rows, folder) for condition, rows in by_condition.items()}
     answer, others = [], []
@@ -80,7 +83,7 @@ def sections_of(
     if resolution:
         others.append(_resolution_section(floors, resolution, folder))
     if coverage:
-        others.append(_coverage_section(coverage))
+        others.append(replace(_coverage_section(coverage), paragraphs=tuple(doubts)))
     if failures:
         others.append(Section("Failed cases", tables=(Table("Failures", ("case", "reason"), tuple(failures.items())),)))
     return [*answer, *(replace(section, folded=bool(answer)) for section in others)]
@@ -99,16 +102,28 @@ def _answer(
         if errors[t][0] is not None or t in still
     )
     columns = ("tissue", "error: RMSE", "bias", "noise floor: median", "p95", "displacement error: RMSE, mm")
-    tables = [Table("Error of the max. shear by tissue", columns, rows, _OF_ANSWER)]
+    preset, voxel, snr = usual
+    of_usual = f"Error of the max. shear by tissue: {preset}, voxels of {voxel} mm, SNR {snr:g}"
+    tables = [Table(of_usual, columns, rows, _OF_ANSWER)]
     if len(by_condition) > 1:
-        every = tuple(
-            (*one, *(_told(_over_motions(of, tissue)[0]) for tissue in _TISSUES)) for one, of in by_condition.items()
-        )
-        tables.append(Table("RMSE of the max. shear by condition", (*_CONDITION, *_TISSUES), every))
+        tables.insert(0, _compared(by_condition, floors))
     return Section(
         "Error of the maximum shear strain", tables=tuple(tables), pictures=pictures,
         paragraphs=(_sentence(usual, by_condition[usual], floors),), pictures_first=True,
     )  # fmt: skip
+
+
+def _compared(by_condition: Mapping[_Condition, Sequence[ErrorRow]], floors: Sequence[FloorRow]) -> Table:
+    """RMSE and noise floor of each preset at each voxel size and SNR, by tissue."""
+    noise = {(floor.condition, floor.tissue): floor.shear_p50 for floor in floors}
+
+    def told(condition: _Condition, tissue: str) -> Cell:
+        error, of_noise = _over_motions(by_condition[condition], tissue)[0], noise.get((condition, tissue))
+        return _told(error) if error is None or of_noise is None else f"{error:.3f} ({of_noise:.3f})"
+
+    rows = tuple((*one, *(told(one, tissue) for tissue in _TISSUES)) for one in by_condition)
+    brackets = "In brackets: noise floor (median), where there is a pair without strain." if noise else ""
+    return Table("RMSE of the max. shear by preset, voxel size and SNR", (*_CONDITION, *_TISSUES), rows, brackets)
 
 
 def answers(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> list[str]:
@@ -119,6 +134,19 @@ def answers(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> list[str]
     usual = _usual(conditions)
     beside = [one for one in conditions if one[1:] == usual[1:] and one != usual]
     return [_sentence(one, [r for r in errors if r.condition == one], floors) for one in (usual, *beside)]
+
+
+def by_motion(errors: Sequence[ErrorRow]) -> list[str]:
+    """The RMSE of the max. shear (its bias) in each tissue, a line for each condition and motion."""
+    told: dict[tuple[_Condition, str], list[str]] = {}
+    for row in errors:
+        if row.by == "all" and row.tissue in _TISSUES:
+            words = f"{row.tissue} {row.shear_rmse:.3f} ({row.shear_bias:+.3f})"
+            told.setdefault((row.condition, motion_of(row)), []).append(words)
+    return [
+        f"{preset}, {voxel} mm, SNR {snr:g}, {motion}: RMSE of the max. shear (bias): {', '.join(of)}"
+        for ((preset, voxel, snr), motion), of in told.items()
+    ]
 
 
 def _usual(conditions: Iterable[_Condition]) -> _Condition:
@@ -169,8 +197,9 @@ def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tu
 
 
 def motion_of(row: ErrorRow) -> str:
-    """The motion of errors, with the voxels by which bones and skin were too large in the label maps."""
-    return row.motion + (f", labels {row.labels_off:+d}" if row.labels_off else "")
+    """The motion of errors, with the voxels by which the label map or bone mask was too large or too small."""
+    size = "large" if row.labels_off > 0 else "small"
+    return row.motion + (f", labels {abs(row.labels_off)} voxel too {size}" if row.labels_off else "")
 
 
 def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow], pictures: Sequence[Picture]) -> Section:

@@ -12,7 +12,7 @@ from dvc.io.result_folder import FIGURES, PROVENANCE, REPORT
 from dvc.report.page import record_lines, write_report
 from mrstrain.measurement.engines import AT_BONE, GAUSS_NEWTON, WITH_LABELS
 from mrstrain.records.provenance import provenance
-from mrstrain.truth.accuracy_page import HOW_TO_READ, answers, motion_of, sections_of
+from mrstrain.truth.accuracy_page import HOW_TO_READ, answers, by_motion, sections_of
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow
 
 _HEELS, _STRAINED = 2, 3  # motions with strain, at least, for an error model
@@ -32,7 +32,7 @@ class AccuracyStudy:
     failures : dict
         Name of each case without a result, and why.
     too_few : tuple of str
-        A sentence on each engine that was given too few heels or motions for an error model.
+        A sentence on the engines that were given too few heels or motions for an error model.
     """
 
     out: Path
@@ -73,9 +73,9 @@ class AccuracyStudy:
         few = _too_few(runs)
         study = cls(out, errors, floors, resolution, coverage, failures, few)
         with whole_folder(out / FIGURES) as folder:
-            sections = sections_of(errors, floors, resolution, coverage, failures, folder)
+            sections = sections_of(errors, floors, resolution, coverage, failures, folder, doubts=few)
         notes = [f"Incomplete: {len(failures)} of {len(runs) + len(failures)} cases failed."] if failures else []
-        notes += [*few, *study.one_spline]
+        notes += [*([] if coverage else few), *study.one_spline]
         title, lines = "Accuracy of registration engines", record_lines(record)
         write_report(out / REPORT, title, None, sections, [HOW_TO_READ], lines, notes=notes)
         return study
@@ -99,29 +99,25 @@ class AccuracyStudy:
     def summary(self) -> list[str]:
         """Summary, a few lines: the answer of the report first."""
         lines = answers(self.errors, self.floors) + self.one_spline
-        lines += [
-            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {motion_of(r)}, {r.tissue}: max. shear RMSE "
-            f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"
-            for r in self.errors
-            if r.by == "all" and r.tissue == "fat"
-        ]
+        lines += by_motion(self.errors)
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
         return [*lines, *self.too_few, f"Report: {self.out / REPORT}"]
 
 
 def _too_few(runs: Sequence[ErrorSamples]) -> tuple[str, ...]:
-    """A sentence on each engine with too few heels, or motions with strain, for an error model."""
-    found = []
+    """A sentence on the engines with too few heels, or motions with strain, for an error model."""
+    found: dict[tuple[int, int], list[str]] = {}
     for preset in dict.fromkeys(r.case.preset for r in runs):
         strained = [r.case for r in runs if r.case.preset == preset and r.case.motion != "still"]
         heels, motions = (len({getattr(case, of) for case in strained}) for of in ("seed", "motion"))
         if heels < _HEELS or motions < _STRAINED:
-            found.append(
-                f"{preset}: do not rely on the error model; its intervals may contain far fewer than 95 % of the true "
-                f"values (coverage.csv). It needs {_HEELS} heels and {_STRAINED} motions with strain or more; this "
-                f"study has {heels} and {motions}."
-            )
-    return tuple(found)
+            found.setdefault((heels, motions), []).append(preset)
+    return tuple(
+        f"{', '.join(presets)}: do not rely on the error model; its intervals may contain far fewer than 95 % of the "
+        f"true values (coverage.csv). It needs {_HEELS} heels and {_STRAINED} motions with strain or more; this study "
+        f"has {heels} and {motions}."
+        for (heels, motions), presets in found.items()
+    )
 
 
 def _source(runs: Sequence[ErrorSamples]) -> str:

@@ -71,10 +71,13 @@ def test_the_page_begins_with_the_answer_at_the_usual_condition(tmp_path: Path, 
     assert not first.folded
     assert first.pictures_first
     assert [picture.title for picture in first.pictures] == ["Error by true maximum shear strain"]
-    of_tissue, of_condition = first.tables
+    of_condition, of_tissue = first.tables
+    assert of_tissue.title.endswith("by tissue: gauss-newton, voxels of 0.8 mm, SNR 25")
     assert of_tissue.rows[0] == ("fat", 0.035, 0.035, 0.01, 0.01, 0.5)
     assert [row[0] for row in of_tissue.rows] == ["fat", "muscle", "skin"]
-    assert {row[0]: row[3:] for row in of_condition.rows} == {"heel-mr": (0.1,) * 3, "gauss-newton": (0.035,) * 3}
+    assert {row[0]: row[3:] for row in of_condition.rows} == {
+        "heel-mr": (0.1,) * 3, "gauss-newton": ("0.035 (0.010)",) * 3
+    }  # fmt: skip
     assert all(len(table.columns) <= 6 for table in first.tables)
     assert [section.title.split(",")[0] for section in others] == [
         "By motion and tissue: heel-mr", "By motion and tissue: gauss-newton",
@@ -134,7 +137,10 @@ def test_the_terminal_begins_with_the_answer_of_the_page(tmp_path: Path, runs: l
         "gauss-newton fits one smooth spline, as `register --no-borders` does. By default, `register` uses "
         "gauss-newton-bone, or gauss-newton-borders with a label map; measure their error with `--preset`."
     )
-    assert first.startswith("heel-mr, 0.8 mm, SNR 25, smooth, fat: max. shear RMSE")
+    assert first == (
+        "heel-mr, 0.8 mm, SNR 25, smooth: RMSE of the max. shear (bias): fat 0.100 (+0.100), muscle 0.100 (+0.100), "
+        "skin 0.100 (+0.100)"
+    )
     page = (tmp_path / "report.html").read_text()
     assert page.index("measure their error with") < page.index("<img")
     with_labels = in_three_tissues(replace(USUAL, preset="gauss-newton-borders"), 0.02)
