@@ -220,10 +220,11 @@ def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray)
 
 
 def force_displacement(states: Sequence[LoadState]) -> Figure:
-    """Force of the plate over its displacement from first contact on, along the normal (left) and the shear (right)."""
-    figure, spots = chart(2, page_wide=True)
+    """Force of the plate over its displacement from first contact on, along the normal, and along the shear if any."""
+    directions = ("normal", "shear") if any(state.load.sheared for state in states) else ("normal",)
+    figure, spots = chart(len(directions), page_wide=len(directions) > 1)
     look = looks(state.load.name for state in states)
-    for axes, axis, name in zip(spots, (0, 1), ("normal", "shear"), strict=True):
+    for axis, (axes, name) in enumerate(zip(spots, directions, strict=True)):
         for state in states:
             moved, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("displacement_mm", "force_n"))
             axes.plot(moved, force, label=state.load.name, **look[state.load.name].marked)

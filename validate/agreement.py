@@ -114,15 +114,20 @@ def over_loads(rows: Sequence[Agreement], model: str, quantity: str, value: str)
 
 
 def regression_told(rows: Sequence[Agreement], model: str) -> str:
-    """Slope and R² of a model on the measurement, cell by cell, and what they mean; empty if none is defined."""
+    """Slope and R² of a model on the measurement under each load, cell by cell; empty if none is defined."""
+    loads = dict.fromkeys(row.load for row in rows if row.model == model)
     told = []
     for name, quantity in (("displacement", "u_mm"), ("max. shear", "max_shear")):
-        slope, r2 = (over_loads(rows, model, quantity, value) for value in ("slope", "r2"))
-        told += [f"{name} slope {slope}, R² {r2}"] if slope else []
-    several = " over the loads" * (len({row.load for row in rows if row.model == model}) > 1)
+        of = [row for row in rows if (row.model, row.quantity, row.part) == (model, quantity, ALL)]
+        values = [
+            f"{row.slope:z.2f} ({row.r2:z.2f})" + f" under {row.load}" * (len(loads) > 1)
+            for row in of
+            if np.isfinite([row.slope, row.r2]).all()
+        ]
+        told += [f"{name} {', '.join(values)}"] if values else []
     why = " (best by area)" * (len({row.model for row in rows}) > 1)
     means = "Slope and R² are 1 if the fields are equal; R² is near 0 if the strain is in other places than measured."
-    return f"Cell by cell, {model}{why} on the measurement: {'; '.join(told)}{several}. {means}" if told else ""
+    return f"Cell by cell, {model}{why} on the measurement, slope (R²): {'; '.join(told)}. {means}" if told else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,7 +129,7 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
         cause = "The measurement uncertainty does not explain it; the uncertainties that are not given below may do so."
     words = [
         "In all soft tissue, the comparison error exceeds the expanded validation uncertainty (2 u_val) in "
-        f"{beyond} of {len(strains)} quantities of all models. {cause}"
+        f"{beyond} of {len(strains)} quantities of all models (areas not counted). {cause}"
     ]
     known_as = {"u_num": "Uncertainty of the mesh (u_num)", "u_input": "Uncertainty of the inputs (u_input)"}
     words += [f"{known_as[u]} not given: {', '.join(dict.fromkeys(of))}." for u, of in lacking.items() if of]

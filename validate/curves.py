@@ -243,7 +243,9 @@ def bands(
         floors = {model: float(np.median(areas(of[: len(following)], following))) for model, of in of_perfect.items()}
         of_models = {model: areas(simulated[name], on_inner) for model, simulated in curves.items()}
         of_varied = {model: areas(np.array([one[name] for one in of]), on_inner) for model, of in varied.items()}
-        most = np.minimum(most, volumes_ml[inside].sum())
+        # The true curve falls, so what bounds it at one strain bounds it at smaller (below) or larger ones (above).
+        least = np.maximum.accumulate(least[::-1])[::-1]
+        most = np.minimum.accumulate(np.minimum(most, volumes_ml[inside].sum()))
         result[name] = Band(outer, least, most, of_models, floors, factor, of_varied, on_outer)
     return result
 

@@ -43,8 +43,8 @@ NIIVUE = "0.69.0"
 MEASUREMENT, WITH_MODELS = "Measurement", "Measurement and model files"
 """What a verdict is on: the measurement, or also the files of models, where there is something odd in them."""
 LOPSIDED = (
-    "An interval is not centred on the measured value, because the bias is removed from it: noise raises low strains, "
-    "and smoothing lowers peaks."
+    "Intervals are corrected for the known bias (noise raises low strains, smoothing lowers peaks), so the measured "
+    "value need not lie in the middle."
 )
 """In the note of a table with intervals of a measured strain."""
 METHODS = "Methods text"

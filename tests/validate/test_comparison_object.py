@@ -20,7 +20,7 @@ from dvc.worker import side_by_side
 from tests.pictures import real_pictures
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
-from validate.agreement import Agreement, regression_told
+from validate.agreement import Agreement, over_loads, regression_told
 from validate.ranking import rank_over_loads
 from validate.report import area_rows, load_sections, overview
 from validate.tables import columns_of, read_curves, remove_earlier
@@ -181,10 +181,9 @@ def test_the_headline_is_the_best_match_or_the_area_of_the_best(comparison: Comp
 def test_slope_and_r2_of_the_best_match_are_told_at_once(comparison: Comparison, folder: Path) -> None:
     best = comparison.ranking.areas[0].model
     rows = [a for a in comparison.agreements if (a.model, a.quantity, a.part) == (best, "u_mm", ALL)]
-    slope, r2 = (" to ".join(dict.fromkeys(f"{end(getattr(a, of) for a in rows):.2f}" for end in (min, max)))
-                 for of in ("slope", "r2"))  # fmt: skip
-    told = f"Cell by cell, {best} (best by area) on the measurement: displacement slope {slope}, R² {r2}"
-    assert slope != r2
+    each = ", ".join(f"{a.slope:.2f} ({a.r2:.2f}) under {a.load}" for a in rows)
+    told = f"Cell by cell, {best} (best by area) on the measurement, slope (R²): displacement {each}"
+    assert len({a.slope for a in rows} | {a.r2 for a in rows}) > 1
     page, summary = (folder / "report.html").read_text(), comparison.summary()
     first = summary.index(comparison.ranking.statements[0])
     assert summary[first + 1].startswith(told)
@@ -197,21 +196,22 @@ def test_slope_and_r2_of_the_best_match_are_told_at_once(comparison: Comparison,
     assert re.search(r">slope</th><th[^>]*>R²</th></tr></thead>", table[0])
 
 
-def test_ranges_over_loads_are_told_and_uniform_fields_have_no_slope() -> None:
+def test_each_load_has_its_slope_and_uniform_fields_have_none() -> None:
     def row(load: str, quantity: str, slope: float, r2: float, part: str = ALL) -> Agreement:
         return Agreement("a", load, quantity, part, 10, 1.0, 0.1, 0.1, slope, 0.0, r2, 0.0, 0.5, 0.0, 0.0, 0.0)
 
     one = [row("Load1", "max_shear", 0.414, 0.094), row("Load1", "max_shear", 0.9, 0.9, "fat")]
     told = regression_told(one, "a")
-    assert told.startswith("Cell by cell, a on the measurement: max. shear slope 0.41, R² 0.09. Slope and")
+    assert told.startswith("Cell by cell, a on the measurement, slope (R²): max. shear 0.41 (0.09). Slope and")
     both = [
         *one,
         row("Load1", "u_mm", -0.2, 0.7),
         row("Load2", "max_shear", -0.5, 0.7),
         row("Load3", "u_mm", np.nan, 1),
     ]
-    what = "displacement slope -0.20, R² 0.70 to 1.00; max. shear slope -0.50 to 0.41, R² 0.09 to 0.70"
-    assert f"measurement: {what} over the loads. Slope" in regression_told(both, "a")
+    what = "displacement -0.20 (0.70) under Load1; max. shear 0.41 (0.09) under Load1, -0.50 (0.70) under Load2"
+    assert f"measurement, slope (R²): {what}. Slope" in regression_told(both, "a")
+    assert over_loads(both, "a", "max_shear", "slope") == "-0.50 to 0.41"
     assert regression_told([row("Load1", "u_mm", np.nan, np.nan)], "a") == regression_told(one, "b") == ""
 
 
