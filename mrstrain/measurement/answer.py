@@ -12,6 +12,7 @@ from dvc.images.bone_names import is_bones_name
 from dvc.io.result_folder import QUALITY
 from dvc.report.alike import alike
 from dvc.report.page import LOPSIDED, Cell, Estimate, Section, Table
+from dvc.trust.error_model import POOLED
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 
 _NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
@@ -77,7 +78,7 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     if overlapping and high.interval is not None:
         *others, last = overlapping
         listed = f"{', '.join(others)} and {last}" if others else last
-        told += f" It may be as large in {listed}, since the intervals overlap."
+        told += f" The 95th percentile may be as large in {listed}, since the intervals overlap."
     if beside.floor is not None:
         noise = f"{beside.floor.max_shear_p50:.3f} (median) and {beside.floor.max_shear_p95:.3f} (95th percentile)"
         told += f" The noise floor is {noise}."
@@ -127,6 +128,8 @@ def table_of_loads(measured: Sequence[Section]) -> Table | None:
     bare = [str(row[1]) for row in rows if isinstance(row[3], Estimate) and row[3].interval is None]
     if known and bare:
         note += f" No interval is known in {' and '.join(dict.fromkeys(bare))}."
+    if any(row[1] == POOLED for row in rows):
+        note += f" Without a label map, '{POOLED}' is all but the given bone; other bones are in it."
     caveats = [(section.title, section.caveat) for section in measured if section.summary is not None]
     if len({caveat for _, caveat in caveats}) > 1:
         caveats = [("", one) for one in alike(f"{load}: {caveat}" for load, caveat in caveats if caveat)]
