@@ -61,13 +61,15 @@ def heel(seed: int, work: Path) -> dict[str, object]:
     labels = labels_of(anatomy, grid)
     hidden = hidden_model(work, labels, seed, **how)
     study = images(work, anatomy, labels, hidden, seed, LOADS)
-    write_labels(work / "right.nii.gz", labels_to_mesh(anatomy, labels))
+    right = labels_to_mesh(anatomy, labels)
+    write_labels(work / "right.nii.gz", right)
     write_labels(study / "to_mesh.nii.gz", labels_to_mesh(anatomy, off(labels, bone, skin)))
     (study / "study.toml").write_text(study_text())
     print("\n".join(run(study).summary()), flush=True)
     if not (work / "right.vtu").is_file():
+        bones = [name for name in BONES if right.region(name).inside.any()]
         make_mesh(work / "right.nii.gz", out=work / "right.vtu", edge_mm=TRUE_EDGE_MM, names=work / "right.csv",
-                  bones=BONES)  # fmt: skip
+                  bones=bones)  # fmt: skip
     if not (work / "best" / SETS[-1] / "regions.csv").is_file():
         simulate(work / "right.vtu", out=work / "best", sets=SETS, **how)
     drawn = {"force": force, "along": along, "across": across, "bone_voxels": bone, "skin_voxels": skin}

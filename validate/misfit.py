@@ -22,6 +22,7 @@ from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
 from validate.mapping import MappedFields, check_bones, tissues_of
 
+_OF_RAS = np.array([-1.0, -1.0, 1.0])  # LPS of coordinates in RAS
 _LEAST_OVERLAP, _GOOD_OVERLAP, _SAME_TISSUE, _VOLUME_CHANGE = 0.85, 0.95, 0.8, 0.15
 _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
 _FAR_MM = 50.0  # no plate that presses soft tissue moves the bone so far: a seat sinks into a buttock by 2 to 4 cm
@@ -113,11 +114,20 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
     overlap = float(mesh.volumes_mm3[inside].sum() / smaller)
     if overlap < _LEAST_OVERLAP:
         there = labels.grid.points(labelled)
+        turned = TetMesh(mesh.points_mm * _OF_RAS, mesh.cells, mesh.regions, mesh.facets)
+        otherwise = np.isin(tissues_of(turned, labels, by_mesh=False), [labels.names[number] for number in soft])
+        share = float(mesh.volumes_mm3[otherwise].sum() / smaller)
+        hint = (
+            f" With the signs of x and y reversed (RAS taken for LPS), {100 * share:.0f} % would lie in it: give its "
+            "frame (--model-frame RAS)."
+            if share >= _LEAST_OVERLAP
+            else " Check subject, unit (--model-unit) and frame (LPS or RAS, --model-frame), or map it to the image "
+            "(--to-image)."
+        )
         own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
             f"{path}: only {100 * overlap:.0f} % of the model lies in the labelled soft tissue "
-            f"({100 * _LEAST_OVERLAP:.0f} % is needed). Model: {own}; tissue: {of_tissue} (LPS mm). Check subject, "
-            "unit (--model-unit) and frame (LPS or RAS, --model-frame), or map it to the image (--to-image)."
+            f"({100 * _LEAST_OVERLAP:.0f} % is needed).{hint} Model: {own}; tissue: {of_tissue} (LPS mm)."
         )
     return overlap
 

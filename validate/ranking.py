@@ -23,6 +23,9 @@ Pairs = tuple[tuple[str, str], ...]
 ALL_LOADS = "all loads"
 _SURE, _LEVEL, _HIGH = 0.95, 0.975, 0.95
 
+CLOSER = 0.95
+"""A model is better than `NOTHING` if its area is smaller than this fraction of it."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ranking:
@@ -95,8 +98,8 @@ def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ())
 
 
 def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
-    """Ranked models whose area is no smaller than that of `NOTHING` under the same load."""
-    return [a.model for a in areas if a.best_ml >= nothing.best_ml and not a.levelled]
+    """Ranked models whose area is not clearly (5 %) smaller than that of `NOTHING` under the same load."""
+    return [a.model for a in areas if a.best_ml > CLOSER * nothing.best_ml and not a.levelled]
 
 
 def summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:

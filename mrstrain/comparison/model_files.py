@@ -13,7 +13,7 @@ from dvc.file_names import clash
 from dvc.mesh import box_told
 from dvc.own_files import parse_toml, read_json
 from dvc.tables import refuse_damaged_toml
-from mrstrain.models.variant_files import VariantFolder
+from mrstrain.models.variant_files import VARIANT, VariantFolder
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import matrix_of, read_matrix
 from mrstrain.records.outcome import with_reasons
@@ -88,12 +88,18 @@ def with_variants(
     files: Mapping[str, Sequence[ModelFile]], folders: Sequence[VariantFolder], usual: ModelReading,
     to_image: FloatArray | None = None,
 ) -> tuple[dict[str, list[ModelFile]], list[str]]:  # fmt: skip
-    """The files of the models by load with those of their variants; and a sentence for each variant that has none.
+    """The files of the models by load with those of their variants; and a sentence for each variant that is left out.
 
-    Variants of models that are not compared are left out.
+    That is a variant that has no file, or whose model is not compared.
     """
     bases: dict[tuple[Path, str], ModelFile] = {}
-    notes = list[str]()
+    known = list(dict.fromkeys(model.name for of in files.values() for model in of))
+    notes = [
+        f"{one.place}: its {VARIANT} is of the model '{one.record.model}', which is not compared. The "
+        f"variant is left out. Compared: {', '.join(known)}."
+        for one in folders
+        if one.record.model not in known
+    ]
 
     def lacking(place: Path, load: str) -> str:
         """Why a folder has no result of a load that can be used; empty if it has one."""

@@ -12,6 +12,7 @@ from mrstrain.measurement.answer import table_of_loads
 from validate import NOTHING, Comparison
 from validate.curves import range_told
 from validate.load_comparison import STRAINED
+from validate.ranking import CLOSER
 
 _AREAS = "Areas of all models and loads"
 _NEAREST = (
@@ -51,9 +52,6 @@ def answer_of(
     return [first, *areas]
 
 
-_CLOSER = 0.95  # of the area without deformation
-
-
 def _comparison(folder: Path) -> Comparison | None:
     try:
         return Comparison.read(folder)
@@ -71,7 +69,7 @@ def _nearest(comparison: Comparison) -> Mapping[tuple[str, str], str]:
         if above < STRAINED * whole:
             continue
         areas = [a for a in comparison.areas if (a.load, a.tissue) == (curve.load, curve.tissue) and not a.levelled]
-        limit = _CLOSER * next((a.best_ml for a in areas if a.model == NOTHING), np.inf)
+        limit = CLOSER * next((a.best_ml for a in areas if a.model == NOTHING), np.inf)
         better = sorted((a for a in areas if a.best_ml < limit), key=lambda a: a.best_ml)
         near = [other.model for other in better[1:] if not other.low_ml > better[0].high_ml]  # or not known
         best = better[0].model if better else "none"

@@ -29,16 +29,15 @@ from fe import (
     material_set,
     problems_of,
 )
-from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.options.measurement import in_parallel, refuse_misspelt_auto
-from mrstrain.options.modelling import ModelReading
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.credibility import details_not_given
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
 from mrstrain.studies.plan import Stage, drawn_to_mesh, load_steps, mesh_place, plan
+from mrstrain.studies.results_given import look_at_results
 from validate import check_bones, check_overlap, read_thresholds
 
 _T = TypeVar("_T")
@@ -91,8 +90,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     reference, labels = looked.at_shared()
     looked.at_loaded(reference)
     looked.notes[:0] = looked.grids()
-    if labels is not None and told.models.results:
-        looked.tried(looked.at_results, labels)
+    looked.notes += looked.tried(look_at_results, told, labels, looked.tried) or []
     planned, next_step = looked.tried(plan, told), ""
     if planned is not None and not looked.wrong:  # else only what is wrong counts
         looked.notes += details_not_given(told)
@@ -388,13 +386,3 @@ class _Look:
                 "[models] fixed: 'cut' (the truncation surface) can only be detected if a tissue of the label map is "
                 "named skin."
             )
-
-    def at_results(self, labels: LabelMap) -> None:
-        """Read every result of another code."""
-        study = self.study
-        reading = ModelReading(unfinished=study.models.unfinished)
-        files, notes = model_files(list(study.loads), [study.path(p) for p in study.models.results], reading)
-        self.notes += notes
-        for of in files.values():
-            for file in of:
-                self.tried(file.read, labels.grid)

@@ -6,8 +6,7 @@ from dvc.registration.engine import Regularisation
 from dvc.registration.gauss_newton.level import Weights
 
 _RIGID = {False: "bone", True: "skin"}  # whose strain the weight "rigidity" is of, by `at_interfaces`
-# The change of volume that a hundredth of the soft tissue exceeds: loads of phantom heels reach .048, swelling .054.
-_ASKED = 0.05
+_ASKED = 0.05  # change of volume that a hundredth of the soft tissue exceeds: loads reach .048, swelling has .054
 
 
 @dataclass(frozen=True, slots=True)

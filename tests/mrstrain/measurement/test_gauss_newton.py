@@ -92,6 +92,7 @@ def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
 def test_a_change_of_volume_that_was_allowed_is_told_and_costs_trust(tiny_pair, tmp_path, monkeypatch):
     """By a limit under which every pair asks for one, in what is made of a result."""
     monkeypatch.setattr("dvc.registration.gauss_newton.choice._ASKED", -1.0)
+    monkeypatch.setattr("dvc.registration.gauss_newton.fit._LARGEST", 100.0)  # the pair has voxels of 12 mm3
     for name in ("reference", "loaded"):
         write_image(tmp_path / f"{name}.nii.gz", getattr(tiny_pair, name))
     write_mask(tmp_path / "bone.nii.gz", tiny_pair.bone)
