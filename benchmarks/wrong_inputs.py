@@ -67,7 +67,8 @@ def heel(seed: int, work: Path) -> dict[str, object]:
     (study / "study.toml").write_text(study_text())
     print("\n".join(run(study).summary()), flush=True)
     if not (work / "right.vtu").is_file():
-        bones = [name for name in BONES if right.region(name).inside.any()]
+        there = np.unique(right.labels)
+        bones = [name for number, name in right.names.items() if name in BONES and number in there]
         make_mesh(work / "right.nii.gz", out=work / "right.vtu", edge_mm=TRUE_EDGE_MM, names=work / "right.csv",
                   bones=bones)  # fmt: skip
     if not (work / "best" / SETS[-1] / "regions.csv").is_file():

@@ -118,8 +118,7 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
         otherwise = np.isin(tissues_of(turned, labels, by_mesh=False), [labels.names[number] for number in soft])
         share = float(mesh.volumes_mm3[otherwise].sum() / smaller)
         hint = (
-            f" With the signs of x and y reversed (RAS taken for LPS), {100 * share:.0f} % would lie in it: give its "
-            "frame (--model-frame RAS)."
+            f" Read as RAS, {100 * share:.0f} % would: give its frame (--model-frame RAS)."
             if share >= _LEAST_OVERLAP
             else " Check subject, unit (--model-unit) and frame (LPS or RAS, --model-frame), or map it to the image "
             "(--to-image)."

@@ -9,7 +9,7 @@ from mrstrain.comparison.model_files import model_files
 from mrstrain.models.variant_files import variant_folders
 from mrstrain.options.modelling import ModelReading
 from mrstrain.studies.file import Study
-from validate.misfit import check_in_tissue
+from validate import check_in_tissue
 
 
 def look_at_results(study: Study, labels: LabelMap | None, tried: Callable[..., Any]) -> list[str]:

@@ -133,6 +133,10 @@ def test_refusals_show_both_boxes(tmp_path) -> None:
         misfits(off, labels(), ["bone"])
     for words in ("(85 % is needed)", "(--model-unit)", "(LPS or RAS, --model-frame)", "(--to-image)"):
         assert words in str(told.value)
+    turned = type(mesh)(mesh.points_mm * [-1.0, -1.0, 1.0], mesh.cells)
+    in_ras = replace(aside, deformation=type(aside.deformation)(turned, aside.deformation.u_mm))
+    with pytest.raises(GeometryError, match=r"Read as RAS, 100 % would: give its frame \(--model-frame RAS\)"):
+        misfits(in_ras, labels(), ["bone"])
     file = ModelFile("heel", written(tmp_path, "vtu")["path"], ModelReading(model_unit="m"))
     grid = Grid((40, 40, 40), np.ones(3), np.array([-10.0, -35.0, 25.0]), np.eye(3))
     with pytest.raises(ExtentError, match=r"too large for a body part.*spans 5000 to 15000") as told:

@@ -50,6 +50,17 @@ def test_a_variant_without_a_load_is_told_and_left_out(study: Path) -> None:
     assert not any(f"no result for {load}" in note for load in others for note in done.comparison.notes)
 
 
+def test_a_variant_of_a_model_that_is_not_compared_is_told(study: Path) -> None:
+    place = variant(study, "stronger", 'model = "rigth"\ninput = "force"\nsteps = 1.0\n')
+    files, _ = model_files(list(LOADS), [study / "right", study / "half"], ModelReading())
+    found, (told,) = with_variants(files, variant_folders([place]), ModelReading())
+    assert not any(model.variants for of in found.values() for model in of)
+    assert told == (
+        f"{place}: its variant.toml is of the model 'rigth', which is not compared. The variant is left out. Compared: "
+        "right, half."
+    )
+
+
 def test_a_variant_whose_run_ended_early_is_told_and_left_out(study: Path) -> None:
     place = variant(study, "stronger", 'model = "right"\ninput = "force"\nsteps = 1.0\n')
     first, *others = LOADS

@@ -106,6 +106,15 @@ def test_check_tells_the_further_solutions_and_a_tissue_that_is_not_there(varied
         (varied / "study.toml").write_text(text)
 
 
+def test_check_tells_of_variants_that_are_not_there(varied: Path) -> None:
+    text = (varied / "study.toml").read_text()
+    (varied / "study.toml").write_text(f'{text}variants = ["stronger"]\n')
+    try:
+        assert [one for one in check(varied).wrong if "stronger: no folder in it has a file variant.toml" in one]
+    finally:
+        (varied / "study.toml").write_text(text)
+
+
 @pytest.mark.full_size
 @pytest.mark.usefixtures("stages_in_this_process")
 def test_a_study_draws_its_inputs_and_says_what_each_adds(varied: Path) -> None:
