@@ -120,8 +120,7 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
         hint = (
             f" Read as RAS, {100 * share:.0f} % would: give its frame (--model-frame RAS)."
             if share >= _LEAST_OVERLAP
-            else " Check subject, unit (--model-unit) and frame (LPS or RAS, --model-frame), or map it to the image "
-            "(--to-image)."
+            else " Check subject, unit (--model-unit) and frame (--model-frame), or map it to the image (--to-image)."
         )
         own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(

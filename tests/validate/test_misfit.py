@@ -131,7 +131,7 @@ def test_refusals_show_both_boxes(tmp_path) -> None:
     off = replace(aside, deformation=type(aside.deformation)(moved_away, aside.deformation.u_mm))
     with pytest.raises(GeometryError, match=r"Model: -9 to 11 x 0 to 20 .*tissue: 0.5 to 24 x -3.5 to 24") as told:
         misfits(off, labels(), ["bone"])
-    for words in ("(85 % is needed)", "(--model-unit)", "(LPS or RAS, --model-frame)", "(--to-image)"):
+    for words in ("(85 % is needed)", "(--model-unit)", "(--model-frame)", "(--to-image)"):
         assert words in str(told.value)
     turned = type(mesh)(mesh.points_mm * [-1.0, -1.0, 1.0], mesh.cells)
     in_ras = replace(aside, deformation=type(aside.deformation)(turned, aside.deformation.u_mm))
