@@ -88,6 +88,7 @@ class Watch:
     reports: Mapping[str, Report]
     left: TimeLeft
     _ended: int = 0
+    _failed: int = 0
     _lock: threading.RLock = field(default_factory=threading.RLock)
     _changed: set[str] = field(default_factory=set)  # prefixes of the studies whose page is out of date
     _stop: threading.Event = field(default_factory=threading.Event)
@@ -115,6 +116,7 @@ class Watch:
         """Take the outcome of a stage: one that was to be done tells what it found, with the fraction 1."""
         with self._lock:
             self._ended += 1
+            self._failed += outcome.status == "FAILED"
             if name in self.left.stages:
                 self.left.end(name)
                 self.tell(name, outcome.headline, 1.0)
@@ -123,8 +125,9 @@ class Watch:
 
     @property
     def count(self) -> str:
-        """How many of all stages have ended, in words."""
-        return f"{self._ended} of {sum(len(report.pipeline.stages) for report in self.reports.values())} stages"
+        """How many of all stages have ended, and failed, in words."""
+        stages = sum(len(report.pipeline.stages) for report in self.reports.values())
+        return f"{self._ended} of {stages} stages" + f", {self._failed} failed" * bool(self._failed)
 
     def _tell_all(self) -> None:
         """Tell the share of the whole time, spent and left, that is spent."""

@@ -208,6 +208,13 @@ def test_progress_tells_what_was_found_once_and_the_share_of_the_time(seen: Seen
     assert all(0.0 <= share < 0.1 for case, _, share in seen.events if case == ALL)
 
 
+def test_stages_that_failed_are_counted(seen: Seen) -> None:
+    seen.end("register Load1", MEASURED)
+    seen.end("mesh", "The surface is open.")
+    counts = [what for case, what, _ in seen.events if case == ALL]
+    assert counts[-2:] == ["1 of 5 stages", "2 of 5 stages, 1 failed"]
+
+
 def test_results_that_were_there_already_are_no_reason_to_open_a_browser(seen: Seen) -> None:
     kept = StageOutcome("register Load1", record("register Load1", MEASURED), reused=True)
     seen.pipeline.outcomes["register Load1"] = kept
