@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from dvc import TissueLabels, write_labels
 from dvc.errors import InputError
+from dvc.labelling.boundary_position import position_sd_mm
+from dvc.labelling.near_marks import certain
 from dvc.own_files import read_rows
+from mrstrain.records.outcome import Outcome
+from mrstrain.studies import stages
 from mrstrain.studies.check import check
 from mrstrain.studies.file import read_study
 from mrstrain.studies.plan import Stage, plan
 from mrstrain.studies.run import forecast, run
+from mrstrain.studies.stages import StageResult
 
 TABLE = """
 [uncertainty]
@@ -136,3 +143,33 @@ def test_a_study_draws_its_inputs_and_says_what_each_adds(varied: Path) -> None:
     hurried = run(varied, workers=1, quick=True)
     assert hurried.complete
     assert "was skipped (quick)" in (varied / "results" / "report.html").read_text()
+
+
+def test_boundaries_follow_from_the_probabilities_of_a_label_map_that_was_made(
+    tiny_pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of one whose probabilities are lost, only bone and skin are uncertain, and the summary says why."""
+    labels, seen = tiny_pair.labels, list[object]()
+    write_labels(tmp_path / "tissues.nii.gz", labels)
+
+    def solved(_mesh: Path, **given: object) -> Outcome:
+        seen.append(given["boundaries_mm"])
+        return Outcome(tmp_path, ("soft with one input changed",))
+
+    def varied_with(made: Callable[..., TissueLabels]) -> StageResult:
+        monkeypatch.setattr("mrstrain.measurement.label_files.read_made", made)
+        return stages.vary(
+            lambda *_: None, mesh=tmp_path, labels=tmp_path / "tissues.nii.gz", names=tmp_path / "tissues.csv",
+            loads=[], uncertainty={"labels_voxels": 0.5},
+        )  # fmt: skip
+
+    def lost(*_: object) -> TissueLabels:
+        raise InputError("The probabilities that belong to it cannot be read.")
+
+    monkeypatch.setattr("mrstrain.models.vary.vary", solved)
+    found = TissueLabels(labels, certain(labels))
+    assert varied_with(lambda *_: found).lines[0] == "soft with one input changed"
+    assert varied_with(lost).lines[0] == "The probabilities that belong to it cannot be read."
+    varied_with(lambda *_: None)
+    assert seen == [position_sd_mm(found), None, None]
+    assert set(position_sd_mm(found)) == {name for name in labels.names.values() if name not in ("bone", "ankle")}
