@@ -82,8 +82,10 @@ def with_tissue(mesh: TetMesh, tissue: str, thickness_mm: float) -> tuple[TetMes
     cells = mesh.regions[tissue]
     others = np.setdiff1d(np.arange(len(mesh.cells)), cells)
     nodes, normals = _normals(mesh, cells, _keys(mesh, faces_of(mesh.cells[others])))
-    held = [np.unique(mesh.facets[name]) for name in (BONE, SKIN) if name in mesh.facets]
-    moving = ~np.isin(nodes, np.concatenate(held))
+    held = [mesh.facets[name].ravel() for name in (BONE, SKIN) if name in mesh.facets]
+    moving = ~np.isin(nodes, np.concatenate(held)) if held else np.ones(len(nodes), dtype=bool)
+    if not moving.any():
+        raise MrstrainError(f"'{tissue}' has no interface with other tissues inside the mesh that could be shifted.")
     return _moved(mesh, nodes[moving], normals[moving], thickness_mm)
 
 

@@ -99,7 +99,7 @@ def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ())
 
 def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
     """Ranked models whose area is not clearly (5 %) smaller than that of `NOTHING` under the same load."""
-    return [a.model for a in areas if a.best_ml > CLOSER * nothing.best_ml and not a.levelled]
+    return [a.model for a in areas if a.best_ml >= CLOSER * nothing.best_ml and not a.levelled]
 
 
 def summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
@@ -197,7 +197,7 @@ def _statement(
     near = [b for a, b in pairs if a == best.model]
     of_all = f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other."
     between = f"Area between its strain-volume curve and the measured one{over}" if over else "Area"
-    worse = " It is no better than a model without deformation." * (best.model in no_nearer(ranked, nothing))
+    worse = " It is not 5 % better than a model without deformation." * (best.model in no_nearer(ranked, nothing))
     return f"Best match {where} (area metric): {best.model}{of_all} {between}: {area}; {scale}{worse}{caveat}"
 
 

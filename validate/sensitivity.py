@@ -24,7 +24,10 @@ MESH = "mesh"
 LABELS = "labels-"
 """Beginning of the names of inputs that stand for the boundary of a tissue in the label map, such as labels-bone."""
 
-SHARED = ("force", "direction-along", "direction-across", "tape")
+TAPE = "tape"
+"""Name of the input that stands for how firmly the skin sticks to the plate, which loads with shear do not have."""
+
+SHARED = ("force", "direction-along", "direction-across", TAPE)
 """Inputs that are the same for all models of a measurement, so that one draw of them holds for all; so are those that
 begin with `LABELS`. Any other input, such as the mesh or Poisson's ratio, is that of one model alone."""
 

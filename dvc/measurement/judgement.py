@@ -111,7 +111,7 @@ def quality_of(
     errors = None if points is None else target_registration_error(found.total, *points)
     quality = assess(
         maps, found.tissue, bone, similarity=similarity, landmark_errors_mm=errors, floor=floor, in_bone=choice.in_bone,
-        plate_normal=subject.plate_normal, pressed=subject.pressed,
+        plate_normal=subject.pressed_along,
     )  # fmt: skip
     doubts = () if subject.from_image is None else subject.from_image.doubts
     every = [*([found.bone_doubt] if found.bone_doubt else []), *doubts]

@@ -27,9 +27,13 @@ _THICKEST_MM = 2.5  # across thicker slices, an edge is as wide as what it is co
 _FROM_AIR_MM = 3.0
 _SHIFTS_MM = 2.5, 12.0  # shifts that are looked for; masks a voxel too large or small fit best up to 1.8 mm away
 _SHIFTED = 1.25  # times the sharpness of the mask as given: right masks have at most 1.03, those 3 mm off 1.28 and more
-_FITS = 1.5  # right masks have 1.74 and more where they belong, masks 3 mm too large at most 1.27 anywhere
+# Right masks of heels have 1.74 and more, also where they belong if they are beside it; those 3 mm too large have at
+# most 1.27 anywhere.
+_RIGHT, _FITS = 1.7, 1.5
+_AS_SHARP, _ALIKE = 0.97, 0.95  # of the sharpest: the nearest such shift is told, if such shifts have one direction
+_AS_FAR, _ONE_WAY = 1.5, 0.7  # times the shortest; length of the mean of their unit vectors
 _STRONG = 0.95  # quantile of the gradient, above which all edges count alike
-_SEEN = 0.5  # of the surface away from air
+_SEEN = 0.8  # of the surface away from air and from the ends of the image
 _MORE = 1.02  # times the sharpest of those about the image's middle, one of which it is where the origin lies there
 _LEAST, _MOSTLY = 500, 0.5  # voxels of the mask, and the fraction of them that lies on the image in the other frame
 _TO_THE_OTHER = np.array([-1.0, -1.0, 1.0])
@@ -80,7 +84,7 @@ def _edgeless(sharpness: float) -> str:
 
 
 def _shifted(given: float, best: float, shift_mm: FloatArray) -> str:
-    if best < max(_FITS, _SHIFTED * given) or np.linalg.norm(shift_mm) < _SHIFTS_MM[0]:
+    if not (given < _RIGHT and best >= _FITS and best >= _SHIFTED * given) or np.linalg.norm(shift_mm) < _SHIFTS_MM[0]:
         return ""
     along = ", ".join(f"{step + 0.0:.1f}" for step in np.round(shift_mm, 1))
     return (
@@ -93,8 +97,10 @@ def _shifted(given: float, best: float, shift_mm: FloatArray) -> str:
 def nearest_edges(gradient: Float32Array, bone: Mask, body: Mask) -> tuple[float, float, FloatArray]:
     """Sharpness of a mask as given, that of the same mask where it is sharpest, and the shift to there (3,), LPS mm.
 
-    Shifts of up to 12 mm are compared. Here the sharpness is a ratio of means of the image's gradient (ni, nj, nk),
-    strong edges counting alike, more than 3 mm inside the body. The sums for all shifts are one convolution.
+    Shifts of up to 12 mm are compared; of those that are about as sharp, the shortest is given. It is zero if they have
+    no common direction, as of a thick cortex, whose inner edge the mask meets wherever it goes. Here the sharpness is a
+    ratio of means of the gradient of the image (ni, nj, nk), per mm, on the grid of the masks, strong edges counting
+    alike, more than 3 mm inside the body; NaN without a surface there. The sums for all shifts are one convolution.
     """
     grid, edges = bone.grid, bone.grid.spacing_mm
     if not bone.inside.any():
@@ -122,9 +128,13 @@ def nearest_edges(gradient: Float32Array, bone: Mask, body: Mask) -> tuple[float
     enough &= np.sqrt(np.sum(np.square(steps), axis=0)) <= _SHIFTS_MM[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         sharpness = np.where(enough, strength / count * others / beside, 0.0)
-    best = np.unravel_index(np.argmax(sharpness), sharpness.shape)
+    found, far_mm = float(sharpness.max()), np.sqrt(np.sum(np.square(steps), axis=0))
+    best = np.unravel_index(np.argmin(np.where(sharpness >= _AS_SHARP * found, far_mm, np.inf)), sharpness.shape)
+    alike = (sharpness >= _ALIKE * found) & (far_mm <= _AS_FAR * far_mm[best]) & (far_mm > 0.0)
+    ways = np.mean([along[alike] / far_mm[alike] for along in steps], axis=1) if alike.any() else np.zeros(3)
     shift = grid.direction @ [float(along[best]) for along in steps]
-    return float(sharpness[0, 0, 0]), float(sharpness[best]), np.asarray(shift)
+    one_way = np.linalg.norm(ways) >= _ONE_WAY
+    return float(sharpness[0, 0, 0]), float(sharpness[best]), np.asarray(shift if one_way else np.zeros(3))
 
 
 def edge_sharpness(image: Image, bone: Mask, body: Mask) -> float:

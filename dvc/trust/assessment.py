@@ -8,7 +8,7 @@ import numpy as np
 from dvc.arrays import Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Mask
-from dvc.trust.plate_motion import displacement_along_normal, moves_away
+from dvc.trust.plate_motion import displacement_along_normal, moves_away, moves_away_alone
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
 
@@ -78,7 +78,6 @@ def assess(
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
     plate_normal: FloatArray | None = None,
-    pressed: bool = True,
 ) -> Quality:
     """Assess a registration by its strain maps, the similarity of the images, and further evidence.
 
@@ -102,9 +101,8 @@ def assess(
         bone before it was made rigid.
     plate_normal : (3,), optional
         Unit direction, LPS, from the body to a plate that presses on it: the tissue between it and the bone must move
-        towards the bone.
-    pressed : bool
-        Whether a plate is known to press there; otherwise only a larger displacement counts, of images.
+        towards the bone. Without it, and with images (``similarity``), no tissue may move away from the bone on one
+        side by over 1 mm while none moves towards it by as much.
 
     Returns
     -------
@@ -147,8 +145,10 @@ def assess(
     findings += _judged("landmark_error_mm", quality.landmarks["median_mm"])
     if floor is not None:
         findings += _judged("floor_shear_p95", floor.max_shear_p95)
-    if bone is not None and plate_normal is not None and (pressed or similarity is not None):
-        findings += moves_away(displacement_along_normal(maps, tissue, bone, plate_normal), known=pressed)
+    if bone is not None and plate_normal is not None:
+        findings += moves_away(displacement_along_normal(maps, tissue, bone, plate_normal))
+    elif bone is not None and similarity is not None:
+        findings += moves_away_alone(maps, tissue, bone)
     return replace(quality, verdict=together(findings))
 
 

@@ -9,7 +9,9 @@ from dvc.images.image import Mask
 from dvc.trust.verdict import Verdict
 
 _CELL_MM, _LAYER_MM = 3.0, 3.0
-_MOST_MM, _MOST_UNKNOWN_MM = 0.5, 1.0  # where a plate is known to press, and where it may press elsewhere
+_MOST_MM, _MOST_UNKNOWN_MM = 0.5, 1.0  # where a plate is known to press, and where none is known
+_LESS = 1.5  # times what moves towards the bone
+_SIDES = ("left", "right"), ("posterior", "anterior"), ("superior", "inferior")
 
 
 def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, normal: FloatArray) -> float:
@@ -53,24 +55,36 @@ def displacement_along_normal(maps: StrainMaps, tissue: Mask, bone: Mask, normal
     return float(along[outer].mean()) if outer.any() else float("nan")
 
 
-def moves_away(displacement_mm: float, *, known: bool = True) -> list[Verdict]:
-    """A finding where the tissue under the bone moves away from it; none otherwise, or for NaN.
-
-    ``known`` tells whether a plate is known to press there.
-    """
-    limit = _MOST_MM if known else _MOST_UNKNOWN_MM
-    if not displacement_mm > limit:
+def moves_away(displacement_mm: float) -> list[Verdict]:
+    """A finding where the tissue under the bone moves towards the plate; none otherwise, or for NaN."""
+    if not displacement_mm > _MOST_MM:
         return []
-    if known:
-        told = (
-            f"Tissue under the bone moves away from it, by {displacement_mm:.1f} mm on average along the plate normal "
-            f"(limit: 'Use with care' above {limit:g} mm); a plate presses it towards the bone. Check that the "
-            "unloaded and the loaded image are not swapped, and that plate_normal points away from the body."
-        )
-    else:
-        told = (
-            f"Tissue below the bone (inferior) moves away from it, by {displacement_mm:.1f} mm on average (limit: 'Use "
-            f"with care' above {limit:g} mm). Check that the unloaded and the loaded image are not swapped. If the "
-            "tissue was pressed from another side, give the direction to the plate (plate_normal)."
-        )
+    told = (
+        f"Tissue under the bone moves away from it, by {displacement_mm:.1f} mm on average along the plate normal "
+        f"(limit: 'Use with care' above {_MOST_MM:g} mm); a plate presses it towards the bone. Check that the "
+        "unloaded and the loaded image are not swapped, and that plate_normal points away from the body."
+    )
+    return [Verdict("caution", (told,))]
+
+
+def moves_away_alone(maps: StrainMaps, tissue: Mask, bone: Mask) -> list[Verdict]:
+    """A finding where no plate is known and tissue moves away from the bone on one side, but towards it on none.
+
+    Parameters as in `displacement_along_normal`, for the six directions along L, P and S. Tissue that is pressed on one
+    side moves towards the bone there by more than it bulges on others; in swapped images, it moves away by more.
+    """
+    moved = {
+        name: displacement_along_normal(maps, tissue, bone, sign * axis)
+        for axis, names in zip(np.eye(3), _SIDES, strict=True)
+        for sign, name in zip((1.0, -1.0), names, strict=True)
+    }
+    known = {name: mm for name, mm in moved.items() if np.isfinite(mm)}
+    if not known or max(known.values()) <= max(_MOST_UNKNOWN_MM, -_LESS * min(known.values())):
+        return []
+    side = max(known, key=lambda name: known[name])
+    told = (
+        f"Tissue moves away from the bone on its {side} side, by {known[side]:.1f} mm on average (limit: 'Use with "
+        f"care' above {_MOST_UNKNOWN_MM:g} mm), and towards it on none by as much. Check that the unloaded and the "
+        "loaded image are not swapped. If a plate pressed on the body, give the direction to it (plate_normal)."
+    )
     return [Verdict("caution", (told,))]

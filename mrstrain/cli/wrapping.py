@@ -1,10 +1,11 @@
 """Lines for a terminal: what a command says is broken between words, and paths stay in one piece."""
 
 import os
+import re
 import textwrap
 
 _WIDTH = 100  # of a line
-_COMMAND = "mrstrain "
+_COMMAND = re.compile(r"mrstrain \w+ (?!.*[.,;:] )")  # and no sentence that begins with the name
 
 
 def wrapped(message: str, hanging: str = "") -> str:
@@ -15,7 +16,7 @@ def wrapped(message: str, hanging: str = "") -> str:
     """
     lines = list[str]()
     for line in message.splitlines():
-        if line.lstrip().startswith(_COMMAND):
+        if _COMMAND.match(line):
             lines.append(_command(line))
             continue
         indent = line[: len(line) - len(line.lstrip())] + hanging
@@ -30,7 +31,9 @@ def _command(line: str) -> str:
     """A command in lines that a shell reads as one."""
     if os.name == "nt":
         return line
-    parts = textwrap.wrap(
-        line, _WIDTH - 2, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False
-    )  # fmt: skip
-    return " \\\n".join(parts)
+    lines = [""]
+    for part in re.findall(r"(?:'[^']*'|\S)+", line):  # what is in quotation marks stays together
+        if lines[-1].strip() and len(lines[-1]) + 1 + len(part) > _WIDTH - 2:
+            lines.append(" " * 4)
+        lines[-1] += part if not lines[-1].strip() else f" {part}"
+    return " \\\n".join(lines)

@@ -19,6 +19,7 @@ from mrstrain.records.inputs import matrix_of, read_matrix
 from mrstrain.records.outcome import with_reasons
 from validate import FeResult, Variant, check_overlap, read_result
 from validate.run_end import early_end
+from validate.sensitivity import TAPE
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
 SETTINGS = "model.toml"
@@ -119,7 +120,8 @@ def with_variants(
         for one in (folder for folder in folders if folder.record.model == model.name):
             places = [one.place, *([] if one.base is None else [one.base])]
             if why := next(filter(None, (lacking(place, load) for place in places)), ""):
-                notes.append(f"{model.name}: the variant of '{one.record.input}' {why}.")
+                if one.record.input != TAPE:  # a load with shear cannot be without tape
+                    notes.append(f"{model.name}: the variant of '{one.record.input}' {why}.")
                 continue
             base = None
             if one.base is not None:

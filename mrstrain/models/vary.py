@@ -26,7 +26,7 @@ from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.uncertainty import Uncertainty
 from mrstrain.records.outcome import Outcome
-from validate.sensitivity import LABELS
+from validate.sensitivity import LABELS, TAPE
 
 _SHORT = 0.2  # of the time of a whole solution: one that starts from the state of another
 
@@ -234,7 +234,7 @@ def _wholes(setting: _Setting, spread: Uncertainty, taped: bool, lines: list[str
             )
         else:
             towards = {load.name: _towards(setting.plates[load.name]) for load in pressed}
-            made["tape"] = _Whole(towards, pressed, False, 1.0 / spread.tape)
+            made[TAPE] = _Whole(towards, pressed, False, 1.0 / spread.tape)
     return made
 
 

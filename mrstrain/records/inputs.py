@@ -28,10 +28,11 @@ from mrstrain.records.provenance import file_hash
 
 _log = logging.getLogger(__name__)
 _LOCK = ".mrstrain-lock"
-_UNLOADED = re.compile(
-    r"load[ _-]?0(?![.\d]*\d)|unloaded|(?<![a-z])no[ _-]?load|baseline|(?<![a-z])rest(?![a-z])"
-    r"|(?<![a-z\d.])0n(?![a-z\d])", re.IGNORECASE
-)  # fmt: skip
+_UNLOADED = re.compile(r"load[ _-]?0(?![.\d]*\d)|unloaded|(?<![a-z])no[ _-]?load|baseline", re.IGNORECASE)
+_AT_REST = re.compile(r"(?<![a-z])rest(?![a-z])|(?<![a-z\d.])0n(?![a-z\d])", re.IGNORECASE)
+_LOADED = re.compile(
+    r"load[ _-]?[1-9]|(?<![a-z\d.])[1-9]\d*(\.\d+)?n(?![a-z\d])", re.IGNORECASE
+)  # 140N_0N has no shear
 _NAMES_BESIDE = (
     "%s: the labels have no names. There is a table of names beside it, %s; to use it, give it as names (--names %s on "
     "the command line)."
@@ -141,7 +142,8 @@ def matrix_of(rows: object, where: str) -> FloatArray:
 
 def named_unloaded(name: str) -> bool:
     """Whether an image is named like the unloaded one: Load0, heel_unloaded, heel_rest, baseline, heel_0N."""
-    return _UNLOADED.search(image_stem(name)) is not None
+    stem = image_stem(name)
+    return bool(_UNLOADED.search(stem) or (_AT_REST.search(stem) and not _LOADED.search(stem)))
 
 
 def swapped_by_name(load0: Path, loads: Sequence[Path]) -> str:

@@ -27,6 +27,22 @@ def test_a_ball_of_muscle_whose_surface_has_a_known_position_uncertainty(sd_mm: 
     assert found == {"fat": pytest.approx(sd_mm, rel=0.08), "muscle": pytest.approx(sd_mm, rel=0.08)}
 
 
+@pytest.mark.parametrize("room", [0, 14])
+def test_a_probability_far_from_the_boundary_does_not_count(room: int) -> None:
+    """Without a limit to what is near, 2 % everywhere would make 2 mm of .5 mm, and 12 mm with more room around."""
+    shape = tuple(n + 2 * room for n in (34, 36, 32))
+    grid = Grid(shape, np.full(3, 0.8), np.zeros(3))
+    points = grid.points()
+    depth_mm = 9.0 - np.linalg.norm(points - points.reshape(-1, 3).mean(axis=0), axis=-1)
+    muscle = 0.02 + 0.96 * ndtr(depth_mm / 0.5)
+    probability = np.stack([1.0 - muscle, muscle]).astype(np.float32)
+    labels = LabelMap(grid, probability.argmax(axis=0) + 1, {1: "fat", 2: "muscle"})
+    found = position_sd_mm(TissueLabels(labels, probability))
+    assert found["muscle"] == pytest.approx(0.68, abs=0.02)
+    even = np.full_like(probability, 0.5)
+    assert position_sd_mm(TissueLabels(labels, even + (probability - 0.5) * 1e-3))["fat"] == 1.6  # two voxels
+
+
 def test_a_boundary_that_is_certain_has_none() -> None:
     grid = Grid((12, 12, 12), np.ones(3), np.zeros(3))
     labels = np.ones(grid.shape, dtype=np.int64)

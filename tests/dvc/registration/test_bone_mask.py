@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.bone_masks import masks
 from dvc import fit_mask
-from dvc.images.image import Image, Mask
+from dvc.images.image import Grid, Image, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
@@ -86,6 +86,26 @@ def test_a_mask_that_lies_beside_the_bone_is_told_with_the_way_back(heel_at, mov
     assert np.abs(np.array([float(step) for step in told.split(", ")]) - back).max() <= bone.grid.spacing_mm.max() + 0.1
 
 
+@pytest.mark.parametrize(("cortex_mm", "muscle"), [(2.0, 0.5), (4.0, 0.2)])
+@pytest.mark.parametrize("noise", [0.02, 0.1])
+def test_a_shaft_through_the_image_is_told_across_its_axis_alone(cortex_mm, muscle, noise):
+    """Along the axis any shift is as sharp, and the inner edge of a thick cortex is met in every direction."""
+    grid, radius_mm = Grid((80, 80, 40), np.ones(3), np.zeros(3)), 14.0 if cortex_mm > 3.0 else 10.0
+    x, y, _ = np.indices(grid.shape)
+    depth = np.hypot(x - 40.0, y - 40.0)
+    signal = np.select([depth < radius_mm - cortex_mm, depth < radius_mm, depth < 34.0], [1.0, 0.05, muscle], 0.0)
+    image = Image(grid, signal + np.random.default_rng(1).normal(0.0, noise, grid.shape))
+    body, right = Mask(grid, depth < 34.0), depth < radius_mm
+
+    def doubt(*steps: int) -> str:
+        return mask_doubt(image, Mask(grid, np.roll(right, steps, (0, 1, 2))), body)
+
+    assert doubt(0, 0, 0) == ""
+    if cortex_mm < 3.0:
+        assert doubt(1, 1, 0) == ""
+        assert "moved by 6 mm (LPS: 0.0, -6.0, 0.0), its surface" in doubt(0, 6, 0)
+
+
 def test_an_oblique_image_tells_the_way_back_along_the_patients_axes(tiny_pair):
     turn = Rotation.from_euler("xyz", [20.0, -30.0, 40.0], degrees=True).as_matrix()
     grid = tiny_pair.reference.grid.moved_by(turn, np.zeros(3))
@@ -124,7 +144,7 @@ def test_a_mask_that_follows_no_edge_is_told_and_one_that_is_a_voxel_off_is_not(
     for name in ("right", "a voxel too large", "a voxel too small"):
         assert mask_doubt(image, given[name], body) == "", name
     known = not np.isnan(edge_sharpness(image, given[wrong], body))
-    told = "may be off: moved by 1|follows no edge" if "beside" in wrong else "follows no edge"
+    told = r"may be off: moved by \d+ mm|follows no edge" if "beside" in wrong else "follows no edge"
     assert bool(re.search(told, mask_doubt(image, given[wrong], body))) == known
     assert known or wrong == "upper half of the body"  # whose surface in thick slices is all near the air
 

@@ -56,9 +56,11 @@ def test_a_plate_from_another_side_sees_another_surface() -> None:
 
 
 def test_a_loaded_image_taken_for_the_unloaded_one_is_used_with_care() -> None:
-    def level_and_reasons(by: float, normal: np.ndarray | None, **given: object) -> tuple[str, str]:
-        quality = assess(strain_maps(pressed(by), WHOLE), WHOLE, bone(), similarity=ALIKE, in_bone=(0.0, 0.0),
-                         plate_normal=normal, **given)  # fmt: skip
+    def level_and_reasons(by: float, normal: np.ndarray | None, **images: object) -> tuple[str, str]:
+        known = {"similarity": ALIKE} | images
+        quality = assess(
+            strain_maps(pressed(by), WHOLE), WHOLE, bone(), in_bone=(0.0, 0.0), plate_normal=normal, **known
+        )
         return quality.verdict.level, " ".join(quality.verdict.reasons)
 
     level, reasons = level_and_reasons(-0.1, INFERIOR)
@@ -66,14 +68,13 @@ def test_a_loaded_image_taken_for_the_unloaded_one_is_used_with_care() -> None:
     assert "moves away from it, by 2.2 mm" in reasons
     assert "swapped" in reasons
     assert level_and_reasons(0.1, INFERIOR) == level_and_reasons(-0.02, INFERIOR) == ("trust", "")
-    assert level_and_reasons(-0.1, None) == ("trust", "")
-    # where it is not known that a plate presses, the one that is assumed must be clearly contradicted
-    level, reasons = level_and_reasons(-0.1, INFERIOR, pressed=False)
+    # where no plate is known, the side that moves most tells
+    level, reasons = level_and_reasons(-0.1, None)
     assert level == "caution"
-    assert "below the bone (inferior) moves away from it, by 2.2 mm" in reasons
-    assert "pressed from another side, give the direction to the plate" in reasons
-    assert level_and_reasons(-0.04, INFERIOR)[0] == "caution"
-    assert level_and_reasons(-0.04, INFERIOR, pressed=False) == ("trust", "")
+    assert "away from the bone on its superior side, by 3.5 mm" in reasons  # of a strain that is the same everywhere
+    assert "give the direction to it (plate_normal)" in reasons
+    assert level_and_reasons(0.1, None) == level_and_reasons(-0.04, None) == ("trust", "")
+    assert "swapped" not in level_and_reasons(-0.1, None, similarity=None)[1]
 
 
 def test_a_measurement_is_judged_by_the_normal_alone() -> None:

@@ -133,6 +133,8 @@ def test_a_damaged_matrix_is_refused_and_warns_of_nothing(tmp_path: Path, text: 
         ("heel_140N.nii.gz", ["heel_unloaded.nii.gz"], "heel_unloaded.nii.gz"),
         ("Load1.nii.gz", ["Load2.nii.gz", "load_0.nrrd"], "load_0.nrrd"),
         ("Load0.nii.gz", ["Load1.nii.gz", "Load0-again.nii.gz"], ""),
+        ("sub07_115N.nii.gz", ["sub07_rest.nii.gz"], "sub07_rest.nii.gz"),
+        ("heel_60N.nii.gz", ["heel_140N_0N.nii.gz", "Load1_rest.nii.gz", "forest.nii.gz"], ""),
         ("a.nii.gz", ["b.nii.gz"], ""),
         ("heel.nii.gz", ["load01.nii.gz", "Load_05N.nii.gz", "load0.5kg.nii.gz", "mono_load1.nii.gz"], ""),
     ],
