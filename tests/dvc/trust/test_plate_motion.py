@@ -73,7 +73,7 @@ def test_a_loaded_image_taken_for_the_unloaded_one_is_used_with_care() -> None:
     assert level == "caution"
     assert "away from the bone on its superior side, by 3.5 mm" in reasons  # of a strain that is the same everywhere
     assert "give the direction to it (plate_normal)" in reasons
-    assert level_and_reasons(0.1, None) == level_and_reasons(-0.04, None) == ("trust", "")
+    assert level_and_reasons(0.1, None) == level_and_reasons(-0.02, None) == ("trust", "")
     assert "swapped" not in level_and_reasons(-0.1, None, similarity=None)[1]
 
 
