@@ -276,7 +276,7 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
         + " Slope and R² (range over the loads): regression of the model's maximum shear strain on the measured one, "
         "cell by cell. Slope: simulated change per unit of measured change; R²: fraction of the simulated variation "
         "that follows the measurement. Measurement noise lowers both."
-        + " Last row: a model that predicts zero strain everywhere; models whose area is not at least 5 % smaller are marked.",
+        + " Last row: a model that predicts zero strain everywhere; models that are not 5 % better are marked.",
         ((*nothing, "–", "–"),),
     )  # fmt: skip
 
