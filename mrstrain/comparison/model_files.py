@@ -165,7 +165,7 @@ def model_files(
         ]
         for load in loads:
             if load not in chosen:
-                notes.append(f"{name} has no result for {load}.")
+                notes.append(f"{name} has no result for {load}.{_of_no_load(place, loads)}")
             elif reached is not None and reached.get(load, 0.0) < 1.0:
                 share = f"{100 * reached.get(load, 0.0):.0f} %"
                 notes.append(f"{name} reached only {share} of {load}; this load is not compared.")
@@ -210,6 +210,13 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
     if place.stem in (_outcome(place, "reached") or ()):
         raise InputError(f"{place} is a simulation of {place.stem}, but the measured load is {loads[0]}.")
     return place.stem, {loads[0]: place}
+
+
+def _of_no_load(place: Path, loads: Sequence[str]) -> str:
+    """A sentence on results in a folder that are named after no measured load; empty without any."""
+    files = sorted(place.iterdir()) if place.is_dir() else []
+    odd = [file.name for file in files if file.suffix in (".vtu", ".vtk", ".frd", ".xplt") and file.stem not in loads]
+    return f" Its {few(odd, most=3)} is named after no measured load ({few(loads, most=4)})." if odd else ""
 
 
 def _passed_over(name: str, chosen: dict[str, Path]) -> list[str]:

@@ -50,6 +50,17 @@ def test_a_variant_without_a_load_is_told_and_left_out(study: Path) -> None:
     assert not any(f"no result for {load}" in note for load in others for note in done.comparison.notes)
 
 
+def test_a_result_that_is_named_after_no_load_is_told(study: Path) -> None:
+    first, second = LOADS
+    shutil.copytree(study / "half", study / "odd")
+    (study / "odd" / f"{second}.vtu").rename(study / "odd" / "load2_final.vtu")
+    files, notes = model_files(list(LOADS), [study / "odd"], ModelReading())
+    assert [len(files.get(load, [])) for load in LOADS] == [1, 0]
+    assert notes == [
+        f"odd has no result for {second}. Its load2_final.vtu is named after no measured load ({first}, {second})."
+    ]
+
+
 def test_a_variant_of_a_model_that_is_not_compared_is_told(study: Path) -> None:
     place = variant(study, "stronger", 'model = "rigth"\ninput = "force"\nsteps = 1.0\n')
     files, _ = model_files(list(LOADS), [study / "right", study / "half"], ModelReading())
