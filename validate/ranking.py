@@ -197,7 +197,7 @@ def _statement(
     near = [b for a, b in pairs if a == best.model]
     of_all = f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other."
     between = f"Area between its strain-volume curve and the measured one{over}" if over else "Area"
-    worse = " It is not 5 % better than a model without deformation." * (best.model in no_nearer(ranked, nothing))
+    worse = " It is no better than a model without deformation (by 5 %)." * (best.model in no_nearer(ranked, nothing))
     return f"Best match {where} (area metric): {best.model}{of_all} {between}: {area}; {scale}{worse}{caveat}"
 
 
