@@ -3,7 +3,7 @@
     python -m benchmarks.bone_masks --out benchmarks/results/bone_masks.json
 
 Unloaded phantom heels (voxels of 0.8, 1.2 and 0.8 x 0.8 x 2.4 mm, SNR 12, 25 and 50) with right masks of the bone,
-masks that are a voxel too large or too small, and wrong ones. Two measures:
+masks that are a voxel too large or too small, and wrong ones. Three measures:
 
 - edge: the median gradient of the image at the surface of the mask, over that 2.5 to 6 mm from it, more than 3 mm
   inside the body
@@ -64,7 +64,7 @@ def rim(image: Image, mask: Mask) -> float:
 def shifted(image: Image, mask: Mask, body: Mask) -> float:
     """Sharpness of a mask where it is sharpest, over that as given; 1 if it fits nowhere, or best near its place."""
     given, best, shift_mm = nearest_edges(_gradient(image), mask, body)
-    return best / given if best >= _FITS and np.linalg.norm(shift_mm) >= _SHIFTS_MM[0] else 1.0
+    return best / given if given > 0.0 and best >= _FITS and np.linalg.norm(shift_mm) >= _SHIFTS_MM[0] else 1.0
 
 
 def _range(values: list[float]) -> list[float]:

@@ -134,7 +134,8 @@ def nearest_edges(gradient: Float32Array, bone: Mask, body: Mask) -> tuple[float
     ways = np.mean([along[alike] / far_mm[alike] for along in steps], axis=1) if alike.any() else np.zeros(3)
     shift = grid.direction @ [float(along[best]) for along in steps]
     one_way = np.linalg.norm(ways) >= _ONE_WAY
-    return float(sharpness[0, 0, 0]), float(sharpness[best]), np.asarray(shift if one_way else np.zeros(3))
+    given = float(sharpness[0, 0, 0]) if enough[0, 0, 0] else float("nan")
+    return given, float(sharpness[best]), np.asarray(shift if one_way else np.zeros(3))
 
 
 def edge_sharpness(image: Image, bone: Mask, body: Mask) -> float:

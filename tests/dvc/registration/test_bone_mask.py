@@ -151,6 +151,10 @@ def test_a_mask_that_follows_no_edge_is_told_and_one_that_is_a_voxel_off_is_not(
 
 def test_a_thin_body_and_thick_slices_raise_no_doubt(tiny_pair):
     """All of the surface is near the air, or an edge as wide as what it is compared with."""
+    image = tiny_pair.reference
+    whole = tissue_mask(image)
+    assert np.isnan(nearest_edges(_gradient(image), whole, whole)[0])
+    assert "may be off" not in mask_doubt(image, whole, whole)
     grid, inside = tiny_pair.reference.grid, tiny_pair.bone.inside
     noise, everywhere = np.random.default_rng(1).normal(100.0, 10.0, grid.shape), np.ones(grid.shape, dtype=bool)
     assert mask_doubt(Image(grid, noise), Mask(grid, inside), Mask(grid, everywhere))
