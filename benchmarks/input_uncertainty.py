@@ -22,6 +22,7 @@ import json
 import time
 from dataclasses import replace
 from itertools import combinations
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from dvc.trust.truth_draws import TruthDraws
 from fe import LoadStep, NeoHooke, Plate, SolverOptions, Yeoh, cell_size_mm, mesh_steps, problems_of, solve, variation
 from mrstrain.records.provenance import versions
 from validate import ALL, ALL_LOADS, FeResult, LoadCase, Variant, compare_load, rank_over_loads
-from validate.comparison_error import AREA
+from validate.comparison_error import AREA, _statistics
 from validate.ranking import summed
 
 SPREAD = {"force": 0.03, "direction_deg": 2.0, "poisson": 0.5, "labels_mm": 0.4}
@@ -230,17 +231,11 @@ def case(seed: int) -> dict[str, object] | None:
 
 def true_error(exact, stated) -> float:
     """The error of a statistic without errors of measurement, inputs and mesh."""
-    where, name = exact.fields.parts[stated.tissue], stated.statistic
-    volumes = exact.fields.volumes_ml[where]
-
-    def of(shear: np.ndarray) -> float:
-        if name.startswith("volume above"):
-            return float(volumes[shear > float(name.split()[-1])].sum())
-        order = np.argsort(shear)
-        share = np.cumsum(volumes[order]) / volumes.sum()
-        return float(shear[order][np.searchsorted(share, {"median": 0.5, "p95": 0.95}[name])])
-
-    return of(exact.fields.models[stated.model].max_shear[where]) - of(exact.fields.measured.max_shear[where])
+    where, of_strain = exact.fields.parts[stated.tissue], {"median": 0, "p95": 1}
+    levels = [] if stated.statistic in of_strain else [float(stated.statistic.split()[-1])]
+    fields = exact.fields.models[stated.model], exact.fields.measured
+    of = [_statistics(one.max_shear[where], exact.fields.volumes_ml[where], levels) for one in fields]
+    return float((of[0] - of[1])[of_strain.get(stated.statistic, -1)])
 
 
 def told(results, references) -> dict[str, object]:
@@ -260,20 +255,9 @@ def told(results, references) -> dict[str, object]:
             gap = true[load, a, ALL] - true[load, b, ALL]
             said = [int(of.surely_below(b, a)) - int(of.surely_below(a, b)) for of in (band, exact)]
             pairs.append([load, a, b, gap, *said])
+    numbers = attrgetter("error", "u_num", "u_input", "u_d", "low", "high")
     errors = [
-        [
-            e.load,
-            e.model,
-            e.tissue,
-            e.statistic,
-            true_error(exact, e),
-            e.error,
-            e.u_num,
-            e.u_input,
-            e.u_d,
-            e.low,
-            e.high,
-        ]
+        [e.load, e.model, e.tissue, e.statistic, true_error(exact, e), *numbers(e)]
         for one, exact in zip(results, references, strict=True)
         for e in one.errors
         if e.statistic != AREA

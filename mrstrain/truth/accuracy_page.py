@@ -53,8 +53,8 @@ HOW_TO_READ = Section(
         "constrained bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as "
         "strong as under the forces of the published experiment), attached-Load1 and attached-Load3 (tissue attached "
         "to bone, where its strain is largest), wave-L (shear that varies as a cosine of wavelength L mm). Labels 1 "
-        "voxel too large or too small: bones and skin are so in the label map that the registration was given, or the "
-        "bone in its mask.",
+        "voxel too large or too small: the registration was given a label map in which bones and skin are so much too "
+        "large or too small, or such a mask of the bone.",
         "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. A finer resolution "
         "means more noise, so report both.",
         "Bias and SD in the error model are conditional on the measured shear. They apply to tissue strained and "
@@ -69,7 +69,7 @@ def sections_of(
 ) -> list[Section]:  # fmt: skip
     """Sections of the page: the answer, then all else, folded. Their figures are written to a folder.
 
-    ``doubts`` are sentences on the error models, which stand with their validation.
+    ``doubts`` are sentences on the error models, shown in the section on their validation.
     """
     by_condition = {of[0].condition: of for of, _ in _by_condition(errors, floors)}
     pictures = {condition: _pictures(condition, rows, folder) for condition, rows in by_condition.items()}

@@ -111,14 +111,9 @@ def fit_with_interfaces(
     rule = f"{choice.rule}. In skin, {in_skin.rule}" if stage.has_skin else choice.rule
     in_bone = None if pair.bone is None else _moved(smooth, pair.bone)
     choice = replace(
-        choice,
-        rule=rule,
-        tried_in_skin=in_skin.tried,
-        at_interfaces=True,
-        asked=first.asked,
-        coarse=first.coarse,
+        choice, rule=rule, tried_in_skin=in_skin.tried, at_interfaces=True, asked=first.asked, coarse=first.coarse,
         in_bone=in_bone,
-    )
+    )  # fmt: skip
     progress(_DONE[2])
     del stage.slab  # its memory goes to the last steps
     found = stage.whole.descend(coefficients, choice.weights, steps=steps, stop_mm=stop_mm)

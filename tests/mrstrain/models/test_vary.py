@@ -14,7 +14,7 @@ from dvc.mesh import TetMesh
 from mrstrain.models.mesh import _coarser
 from mrstrain.models.simulate import simulate
 from mrstrain.models.variant_files import variant_folders
-from mrstrain.models.vary import vary
+from mrstrain.models.vary import _boundaries, vary
 from mrstrain.options import modelling as options
 from mrstrain.options.uncertainty import Uncertainty
 from tests.blocks import block
@@ -129,6 +129,16 @@ def test_boundaries_move_as_far_as_their_probabilities_tell_but_the_largest_tiss
         depth[name] = [float(np.abs(mesh.points_mm - base.points_mm).max()) for mesh in meshes.values()]
     # the bone by half a voxel of 0.8 mm, the skin by no less
     assert depth == {"told": pytest.approx([0.4, 0.9]), "least": pytest.approx([0.4, 0.4])}
+
+
+def test_a_tissue_is_found_however_its_name_is_spelt(given) -> None:
+    mesh = fe.read_tet_mesh(given["mesh"])
+    spelt = TetMesh(mesh.points_mm, mesh.cells, {"Fat": mesh.regions["fat"], "Skin": mesh.regions["skin"]}, mesh.facets)
+    moving = _boundaries(spelt, None, 0.4)
+    assert [*moving] == ["bone", "skin"]
+    moved, share = moving["skin"](spelt)
+    assert share == 1.0
+    assert np.abs(moved.points_mm - mesh.points_mm).max() == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(
