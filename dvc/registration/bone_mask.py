@@ -22,6 +22,7 @@ _EDGE = 0.75  # of the largest voxel edge: voxels nearer than that to the surfac
 _NEAR_MM = 2.5, 6.0  # distances of the voxels that it is compared with
 _BETTER = 1.2  # on heels, mirror images have at most 0.87 times the sharpness of a right mask
 _FOLLOWS = 1.2  # right masks of heels have 2.0 and more, those a voxel off 1.6 and more (benchmarks.bone_masks)
+_CLEAR = 2.0  # a mask that follows an edge so well is not looked for elsewhere; those 5 mm off have 1.54 at the most
 _LIES = 1.3  # a right mask that was mirrored has more where it belongs
 _THICKEST_MM = 2.5  # across thicker slices, an edge is as wide as what it is compared with
 _FROM_AIR_MM = 3.0
@@ -50,7 +51,7 @@ def mask_doubt(image: Image, bone: Mask, body: Mask) -> str:
     """
     gradient = _gradient(image)
     follows = _inner_sharpness(gradient, bone, body)
-    moved = _shifted(*nearest_edges(gradient, bone, body))
+    moved = "" if follows >= _CLEAR else _shifted(*nearest_edges(gradient, bone, body))
     i, j, k = (slice(_ENDS, n - _ENDS) for n in image.grid.shape)
     gradient, bone = gradient[i, j, k], Mask(bone.grid.part((i, j, k)), bone.inside[i, j, k])
     if not bone.inside.any() or bone.inside.all():
