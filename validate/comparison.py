@@ -19,6 +19,7 @@ from dvc.report.drawing import png_bytes
 from dvc.report.page import (
     MEASUREMENT,
     WITH_MODELS,
+    Banner,
     Picture,
     Section,
     Table,
@@ -31,6 +32,7 @@ from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, report, tables
 from validate.agreement import Agreement, SkinDisplacement, regression_told
+from validate.best_model import banner_of
 from validate.comparison_error import ComparisonError
 from validate.curves import Area, range_told
 from validate.decomposition import Representation
@@ -130,12 +132,22 @@ class Comparison:
     def statements(self) -> tuple[str, ...]:
         """Those of the ranking; after the first, slope and R² of the best match, cell by cell."""
         first, rest = self.ranking.statements[:1], self.ranking.statements[1:]
-        told = regression_told(self.agreements, self._best.model)
+        told = regression_told(self.agreements, self.best)
         return (*first, *([told] if told else []), *rest)
 
     @property
+    def banner(self) -> Banner | None:
+        """What a report says of the models at first sight; None without a model that has every load."""
+        return banner_of(self.ranking, self.errors, self.verdict)
+
+    @property
+    def best(self) -> str:
+        """The model with the smallest area over all loads; under any load, if no model has every load."""
+        return self._best.model
+
+    @property
     def _best(self) -> Area:
-        """The smallest area over all loads; under any load, if no model has every load."""
+        """The area of the best model."""
         ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
         return min(ranked, key=lambda a: (a.levelled, a.best_ml))
 
@@ -215,7 +227,9 @@ class Comparison:
         parts, strips = zip(*each(write_one, self.loads), strict=True)
         of_all = drawings_of_all(strips, self.curves, self.strains, self.ranking, ends)
         pictures = [drawing.save(target / stem) for stem, drawing in of_all.items()]
-        first = overview(self.loads, self.ranking, self.warnings, (*self.statements, *notes), pictures)
+        banner = self.banner
+        told = [one for one in (*self.statements, *notes) if banner is None or one not in banner.paragraphs]
+        first = overview(self.loads, self.ranking, self.warnings, told, pictures)
         sections = [first, *(section for part in parts for section in part)]
         known = {load: of for load, of in self.verdicts.items() if of is not None}
         levels = {load: of.level for load, of in known.items()}
@@ -232,7 +246,8 @@ class Comparison:
         write_json(target / tables.RECORD, own | about)
         closing, title = closing_sections(self.loads[0].criteria.thresholds, methods, more), "Models and measurement"
         judged, lines = WITH_MODELS if self.warnings else MEASUREMENT, record_lines(about)
-        write_report(target / "report.html", title, self.verdict, sections, closing, lines, judged=judged)
+        page = target / "report.html"
+        write_report(page, title, self.verdict, sections, closing, lines, judged=judged, models=banner)
         return tuple(sections), tuple(closing)
 
     @classmethod

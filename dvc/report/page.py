@@ -52,6 +52,14 @@ METHODS = "Methods text"
 
 
 @dataclass(frozen=True, slots=True)
+class Banner:
+    """A title and sentences below the verdict of a report: the second thing that a reader sees."""
+
+    title: str
+    paragraphs: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
     """A PNG figure (InputError for another) with what it shows and how to read it.
 
@@ -331,18 +339,19 @@ def write_report(
     *,
     judged: str = MEASUREMENT,
     answer: str = "",
+    models: Banner | None = None,
     notes: Sequence[str] = (),
     reload_s: int | None = None,
 ) -> None:
     """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
-    The verdict is on what is ``judged``; the ``answer``, a sentence, stands beside it, unless it is "Do not trust". One
-    HTML file without anything to fetch. All text is escaped, and a browser runs no script but those of this package.
-    With two sections or more a list of them, with their verdicts, stands beside them. ``notes``, a line each, stand
-    below the verdict. Closing sections and provenance are folded. A browser loads a page anew every ``reload_s``
-    seconds. OutputError if the file cannot be written.
+    The verdict is on what is ``judged``; the ``answer``, a sentence, stands beside it, unless it is "Do not trust".
+    What there is to say of ``models`` stands below it. One HTML file without anything to fetch. All text is escaped,
+    and a browser runs no script but those of this package. With two sections or more a list of them, with their
+    verdicts, stands beside them. ``notes``, a line each, stand below the verdict. Closing sections and provenance are
+    folded. A browser loads a page anew every ``reload_s`` seconds. OutputError if the file cannot be written.
     """
-    told = {"title": title, "judged": judged, "verdict": verdict, "answer": answer, "notes": notes}
+    told = {"title": title, "judged": judged, "verdict": verdict, "answer": answer, "models": models, "notes": notes}
     volumes: dict[str, str] = {}  # each once, however many viewers show it
     for viewer in (viewer for section in sections for viewer in section.viewers):
         for volume in (viewer.image, *viewer.overlays):

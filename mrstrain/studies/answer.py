@@ -7,14 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from dvc.errors import InputError
-from dvc.report.page import Picture, Section
+from dvc.report.page import Picture, Section, Table
 from mrstrain.measurement.answer import table_of_loads
 from validate import NOTHING, Comparison
+from validate.best_model import simulated_percentiles
 from validate.curves import range_told
 from validate.load_comparison import STRAINED
 from validate.ranking import CLOSER
 
 _AREAS = "Areas of all models and loads"
+_PREDICTED = (
+    " {model}, 95th percentile: of the model, in the cells that are compared; higher or lower than the measured one, "
+    "with its bias removed, by more than the expanded validation uncertainty (2 u_val)."
+)
 _NEAREST = (
     " Best match: the model with the smallest area between its strain-volume curve and the measured one ({range}) in "
     "that tissue alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, "
@@ -27,12 +32,14 @@ _NEAREST = (
 
 
 def answer_of(
-    measured: Sequence[Section], compared: Sequence[Section], folder: Path, pictures: Sequence[Picture] = ()
-) -> list[Section]:
-    """The first part of a report, from the sections of the loads, and those and the folder of a comparison, if any.
+    measured: Sequence[Section], compared: Sequence[Section], comparison: Comparison | None,
+    pictures: Sequence[Picture] = (),
+) -> list[Section]:  # fmt: skip
+    """The first part of a report, from the sections of the loads, and those and the files of a comparison, if any.
 
-    Its table has a row for each load and tissue: the measured maximum shear strain, and the best match. Without a
-    comparison it has ``pictures`` of the measured strain; with one, its areas are folded.
+    Its table has a row for each load and tissue: the measured maximum shear strain, the 95th percentile that the best
+    match over all loads predicts, and the best match in this tissue. Without a comparison it has ``pictures`` of the
+    measured strain; with one, its areas are folded.
     """
     table = table_of_loads(measured)
     if not compared:
@@ -41,18 +48,34 @@ def answer_of(
         return [Section("Measured strain", None, (table,), tuple(pictures), pictures_first=True)]
     if table is None:
         return list(compared)
-    comparison = _comparison(folder)
     if comparison is not None:
-        nearest = _nearest(comparison)
-        rows = tuple((*row, nearest.get((str(row[0]), str(row[1])), "–")) for row in table.rows)
-        note = table.note + _NEAREST.format(low=comparison.strains[0], range=range_told(comparison.strains))
-        table = replace(table, columns=(*table.columns, "best match"), rows=rows, note=note)
+        table = _with_models(table, comparison)
     first = replace(compared[0], tables=(table,))
     areas = [Section(_AREAS, None, compared[0].tables, folded=True)] if compared[0].tables else []
     return [first, *areas]
 
 
-def _comparison(folder: Path) -> Comparison | None:
+def _with_models(table: Table, comparison: Comparison) -> Table:
+    """The table of the measured strain, with the best match in each tissue, and what the best over all loads predicts.
+
+    The latter needs the measurement uncertainty.
+    """
+    nearest, columns = _nearest(comparison), ["best match"]
+    best, predicted = comparison.best, simulated_percentiles(comparison.errors, comparison.best)
+    note = table.note + _NEAREST.format(low=comparison.strains[0], range=range_told(comparison.strains))
+    if predicted:
+        columns = [f"{best}, 95th percentile", *columns]
+        note = table.note + _PREDICTED.format(model=best) + note.removeprefix(table.note)
+    rows = []
+    for row in table.rows:
+        where = str(row[0]), str(row[1])
+        of_model = (predicted.get(where, "–"),) if predicted else ()
+        rows.append((*row, *of_model, nearest.get(where, "–")))
+    return replace(table, columns=(*table.columns, *columns), rows=tuple(rows), note=note)
+
+
+def comparison_in(folder: Path) -> Comparison | None:
+    """The comparison in a folder; None if there is none that can be read."""
     try:
         return Comparison.read(folder)
     except InputError:

@@ -30,7 +30,7 @@ from mrstrain.options.measurement import MeshAndAxes
 from mrstrain.options.modelling import Directions
 from mrstrain.records.inputs import read_subject
 from mrstrain.records.provenance import provenance, without_folders
-from mrstrain.studies.answer import answer_of
+from mrstrain.studies.answer import answer_of, comparison_in
 from mrstrain.studies.credibility import study_credibility
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome, left_out_of
@@ -70,7 +70,8 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     pictures = [] if compared or subject is None else _side_by_side(study, outcomes, subject)
     verdict = _verdict([s.verdict.among(s.title) for s in of_loads if s.verdict], compared)
     beside = MeasuredBeside.of(_folders(study, outcomes), study.forces)
-    answer = answer_of(of_each, compared[:1], study.out / COMPARISON, pictures)
+    comparison = comparison_in(study.out / COMPARISON) if compared else None
+    answer = answer_of(of_each, compared[:1], comparison, pictures)
     short, answer = told_once(answer, verdict, beside)
     scans = acquisition_section(_folders(study, outcomes), study.acquisition)
     acquisition = [] if scans is None else [scans]
@@ -80,7 +81,8 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     judged = WITH_MODELS if any(one.verdict for one in compared[:1]) else MEASUREMENT
     lines, notes = record_lines(record), _incomplete(outcomes)
     write_report(
-        path, study.study.name, verdict, sections, closing, lines, judged=judged, answer=short, notes=notes
+        path, study.study.name, verdict, sections, closing, lines, judged=judged, answer=short,
+        models=None if comparison is None else comparison.banner, notes=notes,
     )  # fmt: skip
 
 
@@ -116,7 +118,7 @@ def write_page_in_progress(
     of_loads = [section for one in measured for section in one.result.sections]
     pictures = tuple(picture for section in of_loads for picture in _strain(section))
     sections = [
-        *told_once(answer_of(of_loads, (), study.out, pictures), None)[1],
+        *told_once(answer_of(of_loads, (), None, pictures), None)[1],
         Section("Progress", None, (Table("Stages", ("stage", "status", "summary"), tuple(rows)),)),
     ]
     write_report(path, study.study.name, None, sections, (), {}, notes=[told], reload_s=None if ended else _RELOAD_S)

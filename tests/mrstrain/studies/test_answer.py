@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from mrstrain.measurement.answer import MeasuredBeside, most_strained, told_once
 from mrstrain.studies.answer import answer_of
 from tests.validate.test_comparison import case, cube, labels, result, sheared
 from validate import NOTHING, Area, Comparison, Criteria, compare
+from validate.comparison_error import ComparisonError
 from validate.tables import Curve
 
 FAT = RegionRow("fat", "max_shear", 10, 1.0, 10, 0.1, 0.0, 0.131, 0.0, 0.3, 0.42, 0.5, 0.6)
@@ -45,7 +47,9 @@ def section(load: str) -> Section:
 def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path) -> None:
     areas_of = (Table("Area", ("model",), (("near",),)),)
     overview = Section("Models and loads", tables=areas_of, paragraphs=("Best match: near.",))
-    first, areas = answer_of([section("Load1"), section("Load2"), Section("Load3")], [overview], folder)
+    first, areas = answer_of(
+        [section("Load1"), section("Load2"), Section("Load3")], [overview], Comparison.read(folder)
+    )
     (table,), (area,) = first.tables, areas.tables
     assert (first.title, areas.title, area.title) == ("Models and loads", "Areas of all models and loads", "Area")
     assert not first.folded
@@ -60,7 +64,7 @@ def test_each_load_and_tissue_has_its_strain_and_its_nearest_model(folder: Path)
 
 
 def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_tissues_have_none(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     areas = [
         Area("far", "Load1", "fat", 3.0, 0.3, 3.0, 2.5, 3.5, 0.1),
@@ -82,15 +86,26 @@ def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_
         for field in ("measured", "best")
     ]
     known = SimpleNamespace(
-        areas=areas, curves=curves, strains=(0.2, 0.5), ranking=SimpleNamespace(uninformative=("Load2",))
+        areas=areas,
+        curves=curves,
+        strains=(0.2, 0.5),
+        ranking=SimpleNamespace(uninformative=("Load2",)),
+        best="best",
+        errors=(),
     )
-    monkeypatch.setattr("mrstrain.studies.answer.Comparison", SimpleNamespace(read=lambda _: known))
-    (first,) = answer_of([section(load) for load in above], [Section("Models and loads")], tmp_path)
+    compared = [Section("Models and loads")]
+    (first,) = answer_of([section(load) for load in above], compared, cast(Comparison, known))
     assert [row[-1] for row in first.tables[0].rows] == ["best (second)", "–", "none", "–"]
     assert "less than 1 % above 0.2" in first.tables[0].note
+    higher = ComparisonError("best", "Load1", "fat", "p95", 0.5, 0.4, 0.1, np.nan, np.nan, 0.02, 0.02, 0.06, 0.14)
+    monkeypatch.setattr(known, "errors", [higher])
+    (first,) = answer_of([section("Load1"), section("Load2")], compared, cast(Comparison, known))
+    assert first.tables[0].columns[-2:] == ("best, 95th percentile", "best match")
+    assert [row[-2:] for row in first.tables[0].rows] == [("0.500 (higher)", "best (second)"), ("–", "–")]
+    monkeypatch.setattr(known, "errors", ())
     unknown = [replace(a, low_ml=np.nan, high_ml=np.nan) for a in areas]
     monkeypatch.setattr(known, "areas", unknown)
-    (first,) = answer_of([section("Load1")], [Section("Models and loads")], tmp_path)
+    (first,) = answer_of([section("Load1")], compared, cast(Comparison, known))
     assert first.tables[0].rows[0][-1] == "best (second)"  # of which nobody knows whether it is as good
 
 
@@ -130,7 +145,7 @@ def test_the_most_strained_tissue_is_surely_so() -> None:
 def test_the_most_strained_tissue_is_told_once_in_a_report(level: Level | None, folder: Path, tmp_path: Path) -> None:
     verdict = None if level is None else Verdict(level, ("Checked.",))
     overview = Section("Models and loads", paragraphs=("Best match: near.", "Another."))
-    told, sections = told_once(answer_of([section("Load1")], [overview], folder), verdict)
+    told, sections = told_once(answer_of([section("Load1")], [overview], Comparison.read(folder)), verdict)
     write_report(tmp_path / "report.html", "Heel", verdict, sections, (), {}, answer=told)
     page = (tmp_path / "report.html").read_text()
     strain = "Maximum shear strain in fat under Load1: median 0.131 (0.030 to 0.139), 95th percentile 0.420"
@@ -153,7 +168,7 @@ def test_the_noise_floor_is_that_of_any_load_and_none_without_a_repeat_scan(tmp_
 
 def test_intervals_are_told_of_only_where_there_are_any(tmp_path: Path) -> None:
     without = Section("Load1", summary=summary_table([BONE, FAT], []))
-    notes = [answer_of([one], [], tmp_path)[0].tables[0].note for one in (section("Load1"), without)]
+    notes = [answer_of([one], [], None)[0].tables[0].note for one in (section("Load1"), without)]
     assert ["95 %" in note for note in notes] == [True, False]
     assert [LOPSIDED in note for note in notes] == [True, False]
 
@@ -169,17 +184,17 @@ def test_intervals_are_told_of_only_where_there_are_any(tmp_path: Path) -> None:
 )
 def test_what_makes_intervals_less_certain_stands_below_them(told: tuple[str, str], ends: str, tmp_path: Path) -> None:
     loads = [replace(section(f"Load{n}"), caveat=caveat) for n, caveat in enumerate(told, start=1)]
-    note = answer_of(loads, [], tmp_path)[0].tables[0].note
+    note = answer_of(loads, [], None)[0].tables[0].note
     assert note.endswith(f" {ends}")
     assert note.count("Far.") == ends.count("Far.")
 
 
 def test_registrations_alone_and_a_comparison_alone_are_shown_too(folder: Path, tmp_path: Path) -> None:
-    (first,) = answer_of([section("Load1")], [], folder)
+    (first,) = answer_of([section("Load1")], [], None)
     assert first.tables[0].columns == ("load", "tissue", "median", "95th percentile")
     assert "Best match" not in first.tables[0].note
     overview = Section("Models and loads")
-    assert answer_of([Section("Load1")], [overview], folder) == [overview]
-    assert answer_of([], [], folder) == []
-    (first,) = answer_of([section("Load1")], [overview], tmp_path)  # the comparison's tables are not there
+    assert answer_of([Section("Load1")], [overview], None) == [overview]
+    assert answer_of([], [], None) == []
+    (first,) = answer_of([section("Load1")], [overview], None)  # the comparison's tables are not there
     assert first.tables[0].columns == ("load", "tissue", "median", "95th percentile")
