@@ -182,10 +182,10 @@ def _left(spent_s: float, fraction: float) -> str:
 
 
 class _TimeLeft(ProgressColumn):
-    """The time left of a bar, from its share and the time that it took."""
+    """The time left of a bar, from its share and the time that it took. The bar itself never goes back."""
 
     def render(self, task: Task) -> Text:
-        return Text(_left(task.elapsed or 0.0, task.completed))
+        return Text(_left(task.elapsed or 0.0, task.fields.get("fraction", task.completed)))
 
 
 @contextmanager
@@ -209,7 +209,9 @@ def _bars(console: Console, of_all: bool, command_began: float) -> Iterator[OnPr
                 if not of_all and not of_command:  # parts of a case that is no stage of a study begin at 0 each
                     display.reset(bars[case], total=1.0)
                 display.update(bars[case], description=stage if of_command else f"{case}: {stage}")
-            display.update(bars[case], completed=_short_of_all(fraction), visible=visible)
+            share = _short_of_all(fraction)
+            before = next(task.completed for task in display.tasks if task.id == bars[case])
+            display.update(bars[case], completed=max(share, before), fraction=share, visible=visible)
             if of_all and not visible:
                 console.print(f"{case}: {stage}", markup=False, highlight=False)
 
@@ -221,15 +223,17 @@ def _lines(command_began: float) -> OnProgress:
     began: dict[tuple[str, str], float] = {}
     printed_at: dict[tuple[str, str], float] = {}
     of_all = "", -math.inf  # what was under way, and when that was printed
+    highest = 0.0  # share of the whole that was printed: it never falls, though the time left may rise
 
     def progress(case: str, stage: str, fraction: float) -> None:
-        nonlocal of_all
+        nonlocal of_all, highest
         key, now = (case, stage), time.monotonic()
         if case == ALL:
             if stage != of_all[0] or now - of_all[1] >= _LINE_EVERY_S:
                 of_all = stage, now
                 time_left, spent = _left(now - command_began, fraction), duration(now - command_began)
-                share = f"{100 * fraction:.0f} % after {spent}{', ' * bool(time_left)}{time_left}"
+                highest = max(highest, fraction)
+                share = f"{100 * highest:.0f} % after {spent}{', ' * bool(time_left)}{time_left}"
                 line = f"{stage} after {spent}" if fraction >= 1.0 else f"{stage} ({share})"
                 print(line, file=sys.stderr, flush=True)
             return

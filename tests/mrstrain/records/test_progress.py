@@ -70,6 +70,26 @@ def test_a_command_that_tells_what_it_expects_has_one_line_with_the_time_left_of
     ]
 
 
+def test_the_share_never_falls_though_the_time_left_may_rise(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress.live() as told:
+        progress.expect(told, {"Load1": Expected.of(PARTS)})
+        for second, stage in ((10, "aligning"), (150, "registering")):
+            clock[0] = 1000.0 + second
+            told("Load1", stage, 1.0 if stage == "aligning" else 0.55)
+    assert capsys.readouterr().err.splitlines()[1:3] == [
+        "Load1: aligning (63 % after 10 s, about 6 s left)",
+        "Load1: registering (63 % after 2 min, about 2 min left)",  # 55 % of the time
+    ]
+    file = io.StringIO()
+    with progress.live(console=Console(file=file, force_terminal=True, width=100, height=24)) as told:
+        told("all", "working", 0.6)
+        told("all", "working", 0.3)
+        wait_for(lambda: "%" in " ".join(screen(file.getvalue(), 24)))
+        assert " 60 %" in " ".join(screen(file.getvalue(), 24))
+
+
 def test_in_a_terminal_it_has_one_bar() -> None:
     file = io.StringIO()
     with progress.live(console=Console(file=file, force_terminal=True, width=100, height=24)) as told:
