@@ -1,5 +1,6 @@
 """Names of loads, material sets and models, which become names of files: none leads out of the folder of results."""
 
+import difflib
 import os
 import shlex
 import stat
@@ -7,11 +8,13 @@ import subprocess
 import unicodedata
 from collections.abc import Iterable
 from contextlib import suppress
+from pathlib import Path
 
 from dvc.errors import InputError
 
 _MOST_BYTES = 200  # file systems take 255, of which endings need some
 _MOST_OF_A_PATH = 255
+_ALIKE = 0.75  # of two names without their endings, by difflib: some letters too few, too many or exchanged
 _DEVICES = {"con", "prn", "aux", "nul"} | {f"{port}{n}" for port in ("com", "lpt") for n in "0123456789¹²³"}
 
 
@@ -64,7 +67,32 @@ def refuse_missing(path: str | os.PathLike[str]) -> None:
         try:
             os.stat(path)
         except (FileNotFoundError, NotADirectoryError):
-            raise InputError(f"{os.fspath(path)}: no such file or folder. Check the path.") from None
+            raise InputError(missing(path)) from None
+
+
+def _digits(name: str) -> list[str]:
+    return [letter for letter in name if letter.isdigit()]  # Load1 is no misspelt Load2
+
+
+def missing(path: str | os.PathLike[str], what: str = "file or folder", advice: str = "Check the path.") -> str:
+    """The message for a path at which there is nothing: the folder that is missing, or a name that is nearly the same.
+
+    >>> missing("no/such/folder/Load0.nii.gz")
+    "no/such/folder/Load0.nii.gz: no such file or folder, since there is no folder 'no'. Check the path."
+    """
+    place = Path(path)
+    gone = [folder for folder in place.parents if not folder.is_dir()]
+    if gone:
+        return f"{place}: no such {what}, since there is no folder '{gone[-1]}'. {advice}"
+    try:
+        beside = [name for name in sorted(os.listdir(place.parent)) if _digits(name) == _digits(place.name)]
+    except OSError:
+        beside = []
+    by_stem = {name.partition(".")[0]: name for name in beside}
+    likely = difflib.get_close_matches(place.name.partition(".")[0], by_stem, 1, _ALIKE)
+    return f"{place}: no such {what}. " + (
+        f"Did you mean '{by_stem[likely[0]]}', which is there?" if likely else advice
+    )
 
 
 def is_utf8(path: os.PathLike[str]) -> bool:

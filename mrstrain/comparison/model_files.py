@@ -9,7 +9,7 @@ from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.deformation.nodal import OnMesh
 from dvc.errors import ExtentError, InputError, few
-from dvc.file_names import clash
+from dvc.file_names import clash, missing
 from dvc.mesh import box_told
 from dvc.own_files import parse_toml, read_json
 from dvc.tables import refuse_damaged_toml
@@ -199,7 +199,7 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
         return place.resolve().name, files
     if not place.is_file():
         kinds = "a model is a folder with a file for each load, or a file"
-        raise InputError(f"{place}: no such file or folder. Check the path: {kinds}.")
+        raise InputError(missing(place, advice=f"Check the path: {kinds}."))
     if place.stem in loads:
         return place.parent.resolve().name, {place.stem: place}
     if len(loads) > 1:

@@ -15,7 +15,7 @@ from dvc import LabelMap, Subject, fit_mask, read_image, read_labels, read_mask,
 from dvc.arrays import FloatArray
 from dvc.atomic_files import remove_partial
 from dvc.errors import InputError, OutputError, few
-from dvc.file_names import as_typed, clash, is_utf8, refuse_as_file_name
+from dvc.file_names import as_typed, clash, is_utf8, missing, refuse_as_file_name
 from dvc.io.images.labels import read_names
 from dvc.io.images.write import refuse_overwriting_inputs
 from dvc.io.result_folder import QUALITY, REPORT
@@ -114,7 +114,7 @@ def read_matrix(path: Path) -> FloatArray:
             warnings.simplefilter("ignore")  # an empty file is refused below
             rows = np.loadtxt(path, encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file. Check the path.") from error
+        raise InputError(missing(path, "file")) from error
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
     except ValueError as error:

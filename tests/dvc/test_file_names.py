@@ -13,7 +13,7 @@ import pytest
 import dvc
 import fe
 from dvc.errors import InputError
-from dvc.file_names import as_file_name, as_typed, clash
+from dvc.file_names import as_file_name, as_typed, clash, missing, refuse_missing
 from mrstrain import register
 from mrstrain.comparison.model_files import model_files
 from mrstrain.models.simulate import material_sets
@@ -147,3 +147,20 @@ def _study(
     text += "".join(f'[loads."{name}"]\nimage = "{at}.nii"\nnormal_n = 1.0\n' for at, name in enumerate(loads))
     (folder / "study.toml").write_text(f"{text}[models]\nsets = {[*sets]}\nresults = {[*results]}\n", encoding="utf-8")
     return folder
+
+
+def test_a_missing_file_is_told_with_the_one_that_was_meant(tmp_path: Path) -> None:
+    for name in ("Load2.nii.gz", "tissues.nii.gz", "Load0.nii.gz"):
+        (tmp_path / name).touch()
+    typed = "tisues.nii.gz", "load0.nii.gz", "Load0.nii", "Load1.nii.gz", "bone.nii.gz", "a/b/Load0.nii.gz"
+    told = {name: missing(tmp_path / name, "file").partition(": ")[2] for name in typed}
+    assert told == {
+        "tisues.nii.gz": "no such file. Did you mean 'tissues.nii.gz'? It is there.",
+        "load0.nii.gz": "no such file. Did you mean 'Load0.nii.gz'? It is there.",
+        "Load0.nii": "no such file. Did you mean 'Load0.nii.gz'? It is there.",
+        "Load1.nii.gz": "no such file. Check the path.",  # Load2 is another load
+        "bone.nii.gz": "no such file. Check the path.",
+        "a/b/Load0.nii.gz": f"no such file, since there is no folder '{tmp_path / 'a'}'. Check the path.",
+    }
+    with pytest.raises(InputError, match=r"Did you mean 'tissues\.nii\.gz'"):
+        refuse_missing(tmp_path / "tisues.nii.gz")

@@ -8,6 +8,7 @@ import numpy as np
 
 from dvc.arguments import checked
 from dvc.errors import ImageFileError, InputError
+from dvc.file_names import missing
 from dvc.images.image import Grid, Image
 from dvc.io import StrPath
 from dvc.io.images.dicom import is_dicom, read_dicom
@@ -92,7 +93,7 @@ def read_voxels(
     """Grid (LPS mm) and voxels (ni, nj, nk), unchecked, in the file's own number type; otherwise as `read_image`."""
     place = Path(path)
     if not place.exists():
-        raise InputError(f"{place}: no such file or folder. Check the path.")
+        raise InputError(missing(place))
     if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):
         if volume is not None:
             raise InputError(f"{place}: volume={volume} is for 4D files; for DICOM use series.")

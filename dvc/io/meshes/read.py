@@ -11,6 +11,7 @@ from meshio._common import num_nodes_per_cell
 from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
+from dvc.file_names import missing
 from dvc.io import StrPath
 from dvc.io.meshes.abaqus import read_abaqus
 from dvc.io.meshes.ansys import read_ansys
@@ -140,7 +141,7 @@ def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFil
     if path.suffix.lower() not in _READERS:
         raise InputError(f"{path}: the name of a mesh file must end in {', '.join(_READERS)}.")
     if not path.is_file():
-        raise ImageFileError(f"{path}: no such file. Check the path.")
+        raise ImageFileError(missing(path, "file"))
     try:
         return _checked(_READERS[path.suffix.lower()](path), unit, frame)
     except (GeometryError, InputError) as error:
