@@ -90,9 +90,8 @@ def missing(path: str | os.PathLike[str], what: str = "file or folder", advice: 
         beside = []
     by_stem = {name.partition(".")[0]: name for name in beside}
     likely = difflib.get_close_matches(place.name.partition(".")[0], by_stem, 1, _ALIKE)
-    return f"{place}: no such {what}. " + (
-        f"Did you mean '{by_stem[likely[0]]}', which is there?" if likely else advice
-    )
+    meant = f"Did you mean '{by_stem[likely[0]]}', which is there?" if likely else advice
+    return f"{place}: no such {what}. {meant}"
 
 
 def is_utf8(path: os.PathLike[str]) -> bool:

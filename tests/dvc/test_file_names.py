@@ -155,9 +155,9 @@ def test_a_missing_file_is_told_with_the_one_that_was_meant(tmp_path: Path) -> N
     typed = "tisues.nii.gz", "load0.nii.gz", "Load0.nii", "Load1.nii.gz", "bone.nii.gz", "a/b/Load0.nii.gz"
     told = {name: missing(tmp_path / name, "file").partition(": ")[2] for name in typed}
     assert told == {
-        "tisues.nii.gz": "no such file. Did you mean 'tissues.nii.gz'? It is there.",
-        "load0.nii.gz": "no such file. Did you mean 'Load0.nii.gz'? It is there.",
-        "Load0.nii": "no such file. Did you mean 'Load0.nii.gz'? It is there.",
+        "tisues.nii.gz": "no such file. Did you mean 'tissues.nii.gz', which is there?",
+        "load0.nii.gz": "no such file. Did you mean 'Load0.nii.gz', which is there?",
+        "Load0.nii": "no such file. Did you mean 'Load0.nii.gz', which is there?",
         "Load1.nii.gz": "no such file. Check the path.",  # Load2 is another load
         "bone.nii.gz": "no such file. Check the path.",
         "a/b/Load0.nii.gz": f"no such file, since there is no folder '{tmp_path / 'a'}'. Check the path.",
