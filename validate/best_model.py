@@ -1,75 +1,102 @@
 """What a comparison says of the best model at first sight: how its largest strains compare with the measured ones."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from dvc.report.page import Banner
+from dvc.report.page import Banner, Section
 from dvc.trust.verdict import Verdict
 from validate.comparison_error import ComparisonError
 from validate.mapping import ALL
-from validate.ranking import ALL_LOADS, Ranking
+from validate.ranking import ALL_LOADS, Ranking, no_nearer
 
 _P95 = "p95"
 
 
-def banner_of(ranking: Ranking, errors: Sequence[ComparisonError], verdict: Verdict | None) -> Banner | None:
-    """The banner of a report on models; None where no model has every load, or the uncertainty is unknown.
+def banner_of(
+    ranking: Ranking, errors: Sequence[ComparisonError], loads: Collection[str], verdict: Verdict | None
+) -> Banner | None:
+    """The banner of a report on models: the nearest one, and whether its 95th percentile differs from the measured one.
 
-    Its title names the best match over all loads, or the only model, and whether its 95th percentile differs from the
-    measured one by more than the validation uncertainty. Where no load has an informative area, no model is best: the
-    banner holds the statements, which compare the 95th percentiles.
+    None where that cannot be told: without a model that has every load, without the measurement uncertainty under each
+    of the ``loads``, with the ``verdict`` Do not trust, or if no area is informative.
     """
     ranked = [area.model for area in ranking.areas if not area.levelled]
-    if not ranked or not any(error.tissue == ALL for error in errors):
+    tested = [error for error in errors if (error.tissue, error.statistic) == (ALL, _P95)]
+    distrusted = verdict is not None and verdict.level == "distrust"
+    unknown = {error.load for error in tested} != {*loads} or ALL_LOADS in ranking.uninformative
+    if distrusted or unknown or not ranked or not ranking.statements:
         return None
-    if ALL_LOADS in ranking.uninformative:
-        return Banner("Models: not ranked, since the area metric is not informative", ranking.statements)
-    best, only, judged = ranked[0], len(ranked) == 1, ranking.statements[0]
-    high = {e.load: e for e in errors if (e.model, e.tissue, e.statistic) == (best, ALL, _P95) and np.isfinite(e.error)}
-    title = f"Model: {best}" if only else f"Models: {best} is the best match"
-    if verdict is not None and verdict.level == "distrust":
-        return Banner(f"{title}, to a measurement that should not be trusted", (judged,))
-    return Banner(title + _how_far(high), tuple(filter(None, (judged, _beside(best, high)))))
+    of_best = [error for error in tested if error.model == ranked[0]]
+    title = "; ".join(filter(None, (_nearest(ranking, ranked, len({e.model for e in tested})), _sides(of_best))))
+    return Banner(title, (ranking.statements[0], _beside(of_best)))
 
 
-def _how_far(high: Mapping[str, ComparisonError]) -> str:
-    """The end of a title: under how many loads the 95th percentile differs significantly."""
-    apart = [load for load, error in high.items() if error.significant]
-    if not high:
-        return ""
-    if not apart:
-        return ", with no significant difference in the 95th percentile"
-    if len(high) == 1:
-        return ", but its 95th percentile differs significantly"
-    return f", but its 95th percentile differs significantly under {_listed(apart)}"
+def without_banner(section: Section, banner: Banner | None) -> Section:
+    """A section without the sentences that a banner above it has."""
+    told = () if banner is None else banner.paragraphs
+    return replace(section, paragraphs=tuple(one for one in section.paragraphs if one not in told))
 
 
-def _beside(best: str, high: Mapping[str, ComparisonError]) -> str:
-    """A sentence with the 95th percentile under each load, simulated and measured; empty without any."""
-    if not high:
-        return ""
-    told = ", ".join(f"{load} {error.simulated:.3f} against {error.measured:.3f}" for load, error in high.items())
-    return (
-        f"95th percentile of the maximum shear strain in all soft tissue, {best} against the measurement (its bias "
-        f"removed): {told}. A difference is significant if it exceeds the expanded validation uncertainty (2 u_val)."
-    )
-
-
-def simulated_percentiles(errors: Sequence[ComparisonError], model: str) -> dict[tuple[str, str], str]:
-    """By load and tissue: the simulated 95th percentile, and on which side of the measurement it lies, if on one.
-
-    Where the measurement uncertainty is unknown, there is none.
-    """
+def percentiles_beside(errors: Sequence[ComparisonError], model: str) -> dict[tuple[str, str], str]:
+    """By load and tissue: a model's 95th percentile against the measured one, and on which side it is, if on one."""
     return {
-        (error.load, error.tissue): f"{error.simulated:.3f}" + _side(error)
+        (error.load, error.tissue): _against(error)
         for error in errors
         if (error.model, error.statistic) == (model, _P95) and np.isfinite(error.simulated)
     }
 
 
+def _nearest(ranking: Ranking, ranked: Sequence[str], models: int) -> str:
+    best = ranked[0]
+    worse = best in no_nearer(ranking.areas, ranking.nothing)
+    if models == 1:
+        return f"Model: {best}" + ", no better than a model without deformation" * worse
+    if worse:
+        return f"Models: none is better than a model without deformation; {best} is the nearest"
+    near = [b for a, b in ranking.not_distinguishable.get(ALL_LOADS, ()) if a == best]
+    return f"Models: {best} is the nearest" + (f", not distinguishable from {_listed(near)}" if near else "")
+
+
+def _sides(of_best: Sequence[ComparisonError]) -> str:
+    """The end of a title: under which loads the 95th percentile is significantly too high or too low."""
+    tested = [error for error in of_best if np.isfinite(error.error)]
+    if not tested:
+        return ""
+    sides = {side: [error.load for error in tested if _side(error) == side] for side in ("too high", "too low")}
+    apart = [f"{side} under {_listed(of)}" for side, of in sides.items() if of]
+    if apart:
+        return f"its high strains are significantly {', '.join(apart)}"
+    under = f" under {_listed([error.load for error in tested])}" * (len(tested) < len(of_best))
+    return f"no significant difference in its high strains{under}"
+
+
+def _beside(of_best: Sequence[ComparisonError]) -> str:
+    """The 95th percentiles under each load, in sentences, and what makes a difference significant."""
+    told = ", ".join(f"{e.load} {_against(e)}" for e in of_best)
+    by = {
+        "the mesh (u_num)": any(np.isnan(error.u_num) for error in of_best),
+        "the inputs (u_input)": any(np.isnan(error.u_input) for error in of_best),
+    }
+    lacking = [name for name, lacks in by.items() if lacks]
+    also = f", though the uncertainty of {_listed(lacking)} is not given and may explain it" if lacking else ""
+    return (
+        "High strains (95th percentile of the maximum shear strain in all soft tissue, in the compared cells), "
+        f"{of_best[0].model} against measured with its bias removed: {told}. Too high or too low: the difference "
+        f"exceeds twice the known standard uncertainty (2 u_val){also}."
+    )
+
+
+def _against(error: ComparisonError) -> str:
+    if not np.isfinite(error.error):
+        return f"{error.simulated:.3f} (not tested, beyond the measured curve)"
+    side = _side(error)
+    return f"{error.simulated:.3f} against {error.measured:.3f}" + f" ({side})" * bool(side)
+
+
 def _side(error: ComparisonError) -> str:
-    return " (higher)" if error.low > 0.0 else " (lower)" if error.high < 0.0 else ""
+    return "too high" if error.low > 0.0 else "too low" if error.high < 0.0 else ""
 
 
 def _listed(names: Sequence[str]) -> str:

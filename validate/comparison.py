@@ -32,7 +32,7 @@ from dvc.trust.verdict import LEVELS, worst
 from dvc.worker import Each
 from validate import figures, report, tables
 from validate.agreement import Agreement, SkinDisplacement, regression_told
-from validate.best_model import banner_of
+from validate.best_model import banner_of, without_banner
 from validate.comparison_error import ComparisonError
 from validate.curves import Area, range_told
 from validate.decomposition import Representation
@@ -137,8 +137,8 @@ class Comparison:
 
     @property
     def banner(self) -> Banner | None:
-        """What a report says of the models at first sight; None without a model that has every load."""
-        return banner_of(self.ranking, self.errors, self.verdict)
+        """What a report says of the models at first sight; None where that cannot be told."""
+        return banner_of(self.ranking, self.errors, self.coverage_ml, self.verdict)
 
     @property
     def best(self) -> str:
@@ -227,9 +227,7 @@ class Comparison:
         parts, strips = zip(*each(write_one, self.loads), strict=True)
         of_all = drawings_of_all(strips, self.curves, self.strains, self.ranking, ends)
         pictures = [drawing.save(target / stem) for stem, drawing in of_all.items()]
-        banner = self.banner
-        told = [one for one in (*self.statements, *notes) if banner is None or one not in banner.paragraphs]
-        first = overview(self.loads, self.ranking, self.warnings, told, pictures)
+        first = overview(self.loads, self.ranking, self.warnings, (*self.statements, *notes), pictures)
         sections = [first, *(section for part in parts for section in part)]
         known = {load: of for load, of in self.verdicts.items() if of is not None}
         levels = {load: of.level for load, of in known.items()}
@@ -246,8 +244,8 @@ class Comparison:
         write_json(target / tables.RECORD, own | about)
         closing, title = closing_sections(self.loads[0].criteria.thresholds, methods, more), "Models and measurement"
         judged, lines = WITH_MODELS if self.warnings else MEASUREMENT, record_lines(about)
-        page = target / "report.html"
-        write_report(page, title, self.verdict, sections, closing, lines, judged=judged, models=banner)
+        shown, page = [without_banner(first, self.banner), *sections[1:]], target / "report.html"
+        write_report(page, title, self.verdict, shown, closing, lines, judged=judged, models=self.banner)
         return tuple(sections), tuple(closing)
 
     @classmethod

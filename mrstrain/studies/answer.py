@@ -10,24 +10,25 @@ from dvc.errors import InputError
 from dvc.report.page import Picture, Section, Table
 from mrstrain.measurement.answer import table_of_loads
 from validate import NOTHING, Comparison
-from validate.best_model import simulated_percentiles
+from validate.best_model import percentiles_beside
 from validate.curves import range_told
 from validate.load_comparison import STRAINED
 from validate.ranking import CLOSER
 
 _AREAS = "Areas of all models and loads"
 _PREDICTED = (
-    " {model}, 95th percentile: of the model, in the cells that are compared; higher or lower than the measured one, "
-    "with its bias removed, by more than the expanded validation uncertainty (2 u_val)."
+    " {model} against measured: 95th percentiles in the compared cells, which may be part of a tissue; the bias "
+    "of the measurement is removed. Too high, too low: the difference exceeds twice the known standard uncertainty "
+    "(2 u_val). A dash there: not compared, or no uncertainty is known."
 )
 _NEAREST = (
     " Best match: the model with the smallest area between its strain-volume curve and the measured one ({range}) in "
     "that tissue alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, "
     "so another model may be best. In brackets: other models that may be as good, since their 95 % intervals overlap "
     "with that of the best match, or are not known; no significance test is made for a single tissue. All of them have "
-    "an area at least 5 % smaller than no deformation; none: no model has. A dash: hardly any of the tissue is strained"
-    " (less than 1 % above {low:g}), so its areas are not informative. If that holds for a whole load, a sentence "
-    "above tells how many times the measured strain each model predicts."
+    "an area at least 5 % smaller than no deformation; none: no model has. A dash there: hardly any of the tissue is "
+    "strained (less than 1 % above {low:g}), so its areas are not informative. If that holds for a whole load, a "
+    "sentence above tells how many times the measured strain each model predicts."
 )
 
 
@@ -61,10 +62,11 @@ def _with_models(table: Table, comparison: Comparison) -> Table:
     The latter needs the measurement uncertainty.
     """
     nearest, columns = _nearest(comparison), ["best match"]
-    best, predicted = comparison.best, simulated_percentiles(comparison.errors, comparison.best)
+    best, known = comparison.best, comparison.banner is not None
+    predicted = percentiles_beside(comparison.errors, best) if known else {}
     note = table.note + _NEAREST.format(low=comparison.strains[0], range=range_told(comparison.strains))
     if predicted:
-        columns = [f"{best}, 95th percentile", *columns]
+        columns = [f"{best} against measured, 95th percentile", *columns]
         note = table.note + _PREDICTED.format(model=best) + note.removeprefix(table.note)
     rows = []
     for row in table.rows:

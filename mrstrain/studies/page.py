@@ -37,6 +37,7 @@ from mrstrain.studies.pipeline import StageOutcome, left_out_of
 from mrstrain.studies.plan import COMPARISON, REGISTRATION
 from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import error_against_truth
+from validate.best_model import without_banner
 
 _BY_A_PERSON = {"acquisition", "credibility"}  # tables of the study file with free text
 _OF_A_LOAD = "max. shear, median / 90th percentile:"  # in a line of numbers, which a table or picture shows, too
@@ -71,7 +72,8 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     verdict = _verdict([s.verdict.among(s.title) for s in of_loads if s.verdict], compared)
     beside = MeasuredBeside.of(_folders(study, outcomes), study.forces)
     comparison = comparison_in(study.out / COMPARISON) if compared else None
-    answer = answer_of(of_each, compared[:1], comparison, pictures)
+    models = None if comparison is None or (verdict and verdict.level == "distrust") else comparison.banner
+    answer = answer_of(of_each, [without_banner(one, models) for one in compared[:1]], comparison, pictures)
     short, answer = told_once(answer, verdict, beside)
     scans = acquisition_section(_folders(study, outcomes), study.acquisition)
     acquisition = [] if scans is None else [scans]
@@ -82,7 +84,7 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     lines, notes = record_lines(record), _incomplete(outcomes)
     write_report(
         path, study.study.name, verdict, sections, closing, lines, judged=judged, answer=short,
-        models=None if comparison is None else comparison.banner, notes=notes,
+        models=models, notes=notes,
     )  # fmt: skip
 
 

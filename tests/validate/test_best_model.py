@@ -11,7 +11,7 @@ import pytest
 from dvc.trust.verdict import Verdict
 from tests.validate.test_comparison import case, cube, error_table, labels, result, sheared
 from validate import ALL, Comparison, Criteria, compare
-from validate.best_model import banner_of, simulated_percentiles
+from validate.best_model import banner_of, percentiles_beside
 from validate.comparison_error import ComparisonError
 from validate.curves import Area
 from validate.ranking import ALL_LOADS, Ranking
@@ -32,57 +32,64 @@ def error(load: str, model: str, difference: float, u_val: float = 0.02, tissue:
     )  # fmt: skip
 
 
+LOADS = ["Load1", "Load2"]
+
+
 @pytest.mark.parametrize(
     ("differences", "end"),
     [
-        ((0.01, -0.03), ", with no significant difference in the 95th percentile"),
-        ((0.05, 0.01), ", but its 95th percentile differs significantly under Load1"),
-        ((0.05, -0.05), ", but its 95th percentile differs significantly under Load1 and Load2"),
-        ((0.05,), ", but its 95th percentile differs significantly"),
-        ((np.nan,), ""),  # beyond the measured curve
+        ((0.01, -0.03), "; no significant difference in its high strains"),
+        ((0.05, 0.01), "; its high strains are significantly too high under Load1"),
+        ((0.05, -0.05), "; its high strains are significantly too high under Load1, too low under Load2"),
+        ((0.05, 0.05), "; its high strains are significantly too high under Load1 and Load2"),
+        ((np.nan, 0.01), "; no significant difference in its high strains under Load2"),  # beyond the measured curve
+        ((np.nan, np.nan), ""),
     ],
 )
-def test_the_title_says_how_far_the_best_model_agrees(differences: tuple[float, ...], end: str) -> None:
-    errors = [error(f"Load{n}", "near", d) for n, d in enumerate(differences, 1)]
+def test_the_title_says_how_far_the_nearest_model_agrees(differences: tuple[float, ...], end: str) -> None:
+    errors = [error(load, "near", d) for load, d in zip(LOADS, differences, strict=True)]
     errors += [error("Load1", "far", 0.3), error("Load1", "near", 0.3, tissue="fat")]  # neither counts
-    banner = banner_of(ranking("near", "far"), errors, Verdict("trust"))
+    banner = banner_of(ranking("near", "far"), errors, LOADS, Verdict("trust"))
     assert banner is not None
-    assert banner.title == f"Models: near is the best match{end}"
+    assert banner.title == f"Models: near is the nearest{end}"
     assert banner.paragraphs[0] == "The statement."
-    if np.isfinite(differences[0]):
-        assert (
-            f"near against the measurement (its bias removed): Load1 {0.4 + differences[0]:.3f} against 0.400"
-            in (banner.paragraphs[1])
-        )
+    assert ("Load1 nan (not tested, beyond" in banner.paragraphs[1]) == np.isnan(differences[0])
+    if differences == (0.05, 0.01):
+        assert "Load1 0.450 against 0.400 (too high), Load2 0.410 against 0.400. " in banner.paragraphs[1]
+        assert "the uncertainty of the mesh (u_num) and the inputs (u_input) is not given" in banner.paragraphs[1]
 
 
-def test_a_single_model_is_no_best_match_and_loads_without_information_rank_none() -> None:
-    errors = [error("Load1", "near", 0.0)]
-    single = banner_of(ranking("near"), errors, None)
+def test_the_title_says_which_models_are_as_near_and_that_none_may_be_near() -> None:
+    errors = [error(load, name, 0.0) for load in LOADS for name in ("near", "far")]
+    near = replace(ranking("near", "far"), not_distinguishable={ALL_LOADS: (("near", "far"),)})
+    worse = replace(ranking("near", "far"), nothing=replace(NOTHING, estimate_ml=1.0))
+    titles = [banner.title for one in (near, worse) if (banner := banner_of(one, errors, LOADS, None))]
+    agrees = "no significant difference in its high strains"
+    assert titles == [
+        f"Models: near is the nearest, not distinguishable from far; {agrees}",
+        f"Models: none is better than a model without deformation; near is the nearest; {agrees}",
+    ]
+    single = banner_of(ranking("near"), errors[::2], LOADS, None)
     assert single is not None
-    assert single.title.startswith("Model: near, with no")
-    unranked = banner_of(ranking("near", "far", uninformative=("Load1", ALL_LOADS)), errors, None)
-    assert unranked is not None
-    assert (unranked.title, unranked.paragraphs) == (
-        "Models: not ranked, since the area metric is not informative", ("The statement.", "Another."),
-    )  # fmt: skip
+    assert single.title == f"Model: near; {agrees}"
 
 
-def test_a_measurement_not_to_be_trusted_judges_no_percentile_and_one_without_uncertainty_none() -> None:
-    errors = [error("Load1", "near", 0.3)]
-    doubtful = banner_of(ranking("near", "far"), errors, Verdict("distrust", ("It folds.",)))
-    assert doubtful is not None
-    assert doubtful.title == "Models: near is the best match, to a measurement that should not be trusted"
-    assert doubtful.paragraphs == ("The statement.",)
-    assert banner_of(ranking("near", "far"), [], None) is None
-    assert banner_of(ranking(), errors, None) is None
+def test_there_is_no_banner_where_it_could_mislead() -> None:
+    errors, both = [error(load, "near", 0.3) for load in LOADS], ranking("near", "far")
+    assert banner_of(both, errors, LOADS, None) is not None
+    assert banner_of(both, errors, LOADS, Verdict("distrust", ("It folds.",))) is None
+    assert banner_of(both, errors[:1], LOADS, None) is None  # no uncertainty is known under Load2
+    assert banner_of(ranking(), errors, LOADS, None) is None  # no model has every load
+    assert banner_of(ranking("near", uninformative=(*LOADS, ALL_LOADS)), errors, LOADS, None) is None
+    assert banner_of(replace(both, statements=()), errors, LOADS, None) is None
 
 
 def test_percentiles_say_on_which_side_of_the_measurement_they_lie() -> None:
     errors = [error("Load1", "near", d, tissue=t) for t, d in (("fat", 0.05), ("skin", -0.05), ("muscle", 0.03))]
     errors += [replace(errors[0], statistic="median"), replace(errors[0], model="far")]
-    assert simulated_percentiles(errors, "near") == {
-        ("Load1", "fat"): "0.450 (higher)", ("Load1", "skin"): "0.350 (lower)", ("Load1", "muscle"): "0.430",
+    assert percentiles_beside(errors, "near") == {
+        ("Load1", "fat"): "0.450 against 0.400 (too high)", ("Load1", "skin"): "0.350 against 0.400 (too low)",
+        ("Load1", "muscle"): "0.430 against 0.400",
     }  # fmt: skip
 
 
@@ -96,5 +103,5 @@ def test_a_report_begins_with_the_verdict_and_the_banner_which_says_it_once(tmp_
     statement = back.banner.paragraphs[0]
     assert statement.startswith("Best match under Load1 (area metric): near")
     assert page.count(statement) == 1
-    assert page.index("Use with care") < page.index("Models: near is the best") < page.index(statement)
+    assert page.index("Use with care") < page.index("Models: near is the nearest") < page.index(statement)
     assert page.index(statement) < page.index('id="part-1"')

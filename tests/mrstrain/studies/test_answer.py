@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dvc.measurement.page import summary_table
-from dvc.report.page import LOPSIDED, Estimate, Section, Table, write_report
+from dvc.report.page import LOPSIDED, Banner, Estimate, Section, Table, write_report
 from dvc.trust.quality import NoiseFloor
 from dvc.trust.regions import RegionRow
 from dvc.trust.uncertainty import Interval
@@ -92,6 +92,7 @@ def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_
         ranking=SimpleNamespace(uninformative=("Load2",)),
         best="best",
         errors=(),
+        banner=Banner("Models"),
     )
     compared = [Section("Models and loads")]
     (first,) = answer_of([section(load) for load in above], compared, cast(Comparison, known))
@@ -100,8 +101,11 @@ def test_models_that_may_be_as_good_are_in_brackets_and_uninformative_loads_and_
     higher = ComparisonError("best", "Load1", "fat", "p95", 0.5, 0.4, 0.1, np.nan, np.nan, 0.02, 0.02, 0.06, 0.14)
     monkeypatch.setattr(known, "errors", [higher])
     (first,) = answer_of([section("Load1"), section("Load2")], compared, cast(Comparison, known))
-    assert first.tables[0].columns[-2:] == ("best, 95th percentile", "best match")
-    assert [row[-2:] for row in first.tables[0].rows] == [("0.500 (higher)", "best (second)"), ("–", "–")]
+    assert first.tables[0].columns[-2:] == ("best against measured, 95th percentile", "best match")
+    assert [row[-2:] for row in first.tables[0].rows] == [
+        ("0.500 against 0.400 (too high)", "best (second)"),
+        ("–", "–"),
+    ]
     monkeypatch.setattr(known, "errors", ())
     unknown = [replace(a, low_ml=np.nan, high_ml=np.nan) for a in areas]
     monkeypatch.setattr(known, "areas", unknown)
