@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from dvc import Verdict
 from dvc.report.page import Banner, Section
-from dvc.trust.verdict import Verdict
 from validate.comparison_error import ComparisonError
 from validate.mapping import ALL
 from validate.ranking import ALL_LOADS, Ranking, no_nearer
