@@ -17,7 +17,7 @@ _P95 = "p95"
 def banner_of(
     ranking: Ranking, errors: Sequence[ComparisonError], loads: Collection[str], verdict: Verdict | None
 ) -> Banner | None:
-    """The banner of a report on models: the nearest one, and whether its 95th percentile differs from the measured one.
+    """The banner of a report on models: the best match, and whether its 95th percentile differs from the measured one.
 
     None where that cannot be told: without a model that has every load, without the measurement uncertainty under each
     of the ``loads``, with the ``verdict`` Do not trust, or if no area is informative.
@@ -29,7 +29,7 @@ def banner_of(
     if distrusted or unknown or not ranked or not ranking.statements:
         return None
     of_best = [error for error in tested if error.model == ranked[0]]
-    title = "; ".join(filter(None, (_nearest(ranking, ranked, len({e.model for e in tested})), _sides(of_best))))
+    title = "; ".join(filter(None, (_best_match(ranking, ranked, len({e.model for e in tested})), _sides(of_best))))
     return Banner(title, (ranking.statements[0], _beside(of_best)))
 
 
@@ -48,15 +48,15 @@ def percentiles_beside(errors: Sequence[ComparisonError], model: str) -> dict[tu
     }
 
 
-def _nearest(ranking: Ranking, ranked: Sequence[str], models: int) -> str:
+def _best_match(ranking: Ranking, ranked: Sequence[str], models: int) -> str:
     best = ranked[0]
     worse = best in no_nearer(ranking.areas, ranking.nothing)
     if models == 1:
         return f"Model: {best}" + ", no better than a model without deformation" * worse
     if worse:
-        return f"Models: none is better than a model without deformation; {best} is the nearest"
+        return f"Models: none is better than a model without deformation; best match {best}"
     near = [b for a, b in ranking.not_distinguishable.get(ALL_LOADS, ()) if a == best]
-    return f"Models: {best} is the nearest" + (f", not distinguishable from {_listed(near)}" if near else "")
+    return f"Models: best match {best}" + (f", not distinguishable from {_listed(near)}" if near else "")
 
 
 def _sides(of_best: Sequence[ComparisonError]) -> str:

@@ -46,12 +46,12 @@ LOADS = ["Load1", "Load2"]
         ((np.nan, np.nan), ""),
     ],
 )
-def test_the_title_says_how_far_the_nearest_model_agrees(differences: tuple[float, ...], end: str) -> None:
+def test_the_title_says_how_far_the_best_match_agrees(differences: tuple[float, ...], end: str) -> None:
     errors = [error(load, "near", d) for load, d in zip(LOADS, differences, strict=True)]
     errors += [error("Load1", "far", 0.3), error("Load1", "near", 0.3, tissue="fat")]  # neither counts
     banner = banner_of(ranking("near", "far"), errors, LOADS, Verdict("trust"))
     assert banner is not None
-    assert banner.title == f"Models: near is the nearest{end}"
+    assert banner.title == f"Models: best match near{end}"
     assert banner.paragraphs[0] == "The statement."
     assert ("Load1 nan (not tested, beyond" in banner.paragraphs[1]) == np.isnan(differences[0])
     if differences == (0.05, 0.01):
@@ -66,8 +66,8 @@ def test_the_title_says_which_models_are_as_near_and_that_none_may_be_near() -> 
     titles = [banner.title for one in (near, worse) if (banner := banner_of(one, errors, LOADS, None))]
     agrees = "no significant difference in its high strains"
     assert titles == [
-        f"Models: near is the nearest, not distinguishable from far; {agrees}",
-        f"Models: none is better than a model without deformation; near is the nearest; {agrees}",
+        f"Models: best match near, not distinguishable from far; {agrees}",
+        f"Models: none is better than a model without deformation; best match near; {agrees}",
     ]
     single = banner_of(ranking("near"), errors[::2], LOADS, None)
     assert single is not None
@@ -103,5 +103,5 @@ def test_a_report_begins_with_the_verdict_and_the_banner_which_says_it_once(tmp_
     statement = back.banner.paragraphs[0]
     assert statement.startswith("Best match under Load1 (area metric): near")
     assert page.count(statement) == 1
-    assert page.index("Use with care") < page.index("Models: near is the nearest") < page.index(statement)
+    assert page.index("Use with care") < page.index("Models: best match near") < page.index(statement)
     assert page.index(statement) < page.index('id="part-1"')
