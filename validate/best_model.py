@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from dvc import Verdict
+from dvc.report.alike import listed
 from dvc.report.page import Banner, Section
 from validate.comparison_error import ComparisonError
 from validate.mapping import ALL
@@ -56,7 +57,7 @@ def _best_match(ranking: Ranking, ranked: Sequence[str], models: int) -> str:
     if worse:
         return f"Models: none is better than a model without deformation; best match {best}"
     near = [b for a, b in ranking.not_distinguishable.get(ALL_LOADS, ()) if a == best]
-    return f"Models: best match {best}" + (f", not distinguishable from {_listed(near)}" if near else "")
+    return f"Models: best match {best}" + (f", not distinguishable from {listed(near)}" if near else "")
 
 
 def _sides(of_best: Sequence[ComparisonError]) -> str:
@@ -65,10 +66,10 @@ def _sides(of_best: Sequence[ComparisonError]) -> str:
     if not tested:
         return ""
     sides = {side: [error.load for error in tested if _side(error) == side] for side in ("too high", "too low")}
-    apart = [f"{side} under {_listed(of)}" for side, of in sides.items() if of]
+    apart = [f"{side} under {listed(of)}" for side, of in sides.items() if of]
     if apart:
         return f"its high strains are significantly {', '.join(apart)}"
-    under = f" under {_listed([error.load for error in tested])}" * (len(tested) < len(of_best))
+    under = f" under {listed([error.load for error in tested])}" * (len(tested) < len(of_best))
     return f"no significant difference in its high strains{under}"
 
 
@@ -80,7 +81,7 @@ def _beside(of_best: Sequence[ComparisonError]) -> str:
         "the inputs (u_input)": any(np.isnan(error.u_input) for error in of_best),
     }
     lacking = [name for name, lacks in by.items() if lacks]
-    also = f", though the uncertainty of {_listed(lacking)} is not given and may explain it" if lacking else ""
+    also = f", though the uncertainty of {listed(lacking)} is not given and may explain it" if lacking else ""
     return (
         "High strains (95th percentile of the maximum shear strain in all soft tissue, in the compared cells), "
         f"{of_best[0].model} against measured with its bias removed: {told}. Too high or too low: the difference "
@@ -97,8 +98,3 @@ def _against(error: ComparisonError) -> str:
 
 def _side(error: ComparisonError) -> str:
     return "too high" if error.low > 0.0 else "too low" if error.high < 0.0 else ""
-
-
-def _listed(names: Sequence[str]) -> str:
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last

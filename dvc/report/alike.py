@@ -1,7 +1,7 @@
-"""Sentences that hold for several loads are told once."""
+"""Sentences that hold for several loads are told once; names are listed in a sentence."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 _SENTENCE = re.compile(r"(?P<of>[^:.(]+?)(?P<kind>, registration \([^)]*\))?: (?P<what>.+)", re.DOTALL)
 
@@ -23,3 +23,13 @@ def alike(sentences: Iterable[str]) -> tuple[str, ...]:
         kind, what = (found["kind"] or "", found["what"]) if found else ("", sentence)
         of.setdefault((kind, what), []).extend([found["of"]] if found else [])
     return tuple(f"{', '.join(names)}{kind}: {what}" if names else what for (kind, what), names in of.items())
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence, at least one.
+
+    >>> listed(["a"]), listed(["a", "b", "c"])
+    ('a', 'a, b and c')
+    """
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last

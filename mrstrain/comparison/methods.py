@@ -9,6 +9,7 @@ import numpy as np
 from dvc.io.images.read import format_of
 from dvc.io.result_folder import PROVENANCE, QUALITY
 from dvc.registration.engines import methods_of
+from dvc.report.alike import listed
 from dvc.report.page import NIIVUE
 from fe import LoadStep
 from mrstrain.measurement.acquisition import acquisition_sentence
@@ -91,17 +92,13 @@ def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
     return (*parts, *(("References", *used) if used else ()))
 
 
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 def _measured(measured: Mapping[str, Path]) -> str:
     """How the displacement was measured; loads that were registered in the same way share a sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
         record = read_record(folder / PROVENANCE)
         groups.setdefault(_registration(record) + _files(record), []).append(load)
-    sentences = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
+    sentences = " ".join(f"{listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
         sentences + " Displacement is given in the unloaded (reference) configuration. Strain is the Green-Lagrange "
         "strain E = (F^T F - I)/2, and the maximum shear strain is half the difference between its largest and "
@@ -175,13 +172,13 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
         *([ours] if sets else []),
         *([f"{_DRIVEN} {' '.join(driven)}"] if driven else []),
         *(["The published material sets are those compiled by Trebbi 2023."] if used & _PUBLISHED else []),
-        *(f"{_listed(names)}: {how}" for how, names in levelled.items()),
-        *([f"Models computed with other programs: {_listed(others)}."] if others else []),
+        *(f"{listed(names)}: {how}" for how, names in levelled.items()),
+        *([f"Models computed with other programs: {listed(others)}."] if others else []),
     ]
 
 
 def _models(names: Sequence[str]) -> str:
-    return f"The model{'s' * (len(names) > 1)} {_listed(names)} {'were' if len(names) > 1 else 'was'} "
+    return f"The model{'s' * (len(names) > 1)} {listed(names)} {'were' if len(names) > 1 else 'was'} "
 
 
 _DRIVEN = (
@@ -212,7 +209,7 @@ def _solver(record: Record) -> str:
     mesh = made and (
         f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}; requested edge length {made['edge_mm']:g} mm)"
     )
-    loads = _listed([f"{step['name']} {LoadStep(**step)}" for path in parameters["paths"] for step in path])
+    loads = listed([f"{step['name']} {LoadStep(**step)}" for path in parameters["paths"] for step in path])
     axes = {load: of.get("plate_axes_lps") for load, of in record.get("outcome", {}).items()}
     if any(own != first for own in axes.values() for first in axes.values()):
         loads += "".join(
@@ -229,7 +226,7 @@ def _solver(record: Record) -> str:
 
 
 def _compared(cells: int, criteria: Criteria) -> str:
-    levels = _listed([f"{t.max_shear:g}" for t in criteria.thresholds])
+    levels = listed([f"{t.max_shear:g}" for t in criteria.thresholds])
     (low, high), version = criteria.strains, versions()["mrstrain"]
     return (
         f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
@@ -246,7 +243,7 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
     errors = _errors(measured)
     checked = [load for load, of in errors.items() if any(r.get("factor") is not None for r in of.get("twin", []))]
     twin = checked and (
-        f"The error bars of {_listed(checked)} were checked by a synthetic warp (the unloaded image warped by the "
+        f"The error bars of {listed(checked)} were checked by a synthetic warp (the unloaded image warped by the "
         "measured displacement, and registered again), and widened where they were too narrow. "
     )
     decomposed = (
@@ -272,8 +269,8 @@ def _of_inputs(comparison: Comparison) -> str:
     by_mesh, by_input = models_with(comparison, "u_num"), models_with(comparison, "u_input")
     if not by_mesh and not by_input:
         return ""
-    parts = [f"the inputs of {_listed(by_input)}"] if by_input else []
-    parts += [f"the mesh of {_listed(by_mesh)} (grid convergence index, Roache 1994)"] if by_mesh else []
+    parts = [f"the inputs of {listed(by_input)}"] if by_input else []
+    parts += [f"the mesh of {listed(by_mesh)} (grid convergence index, Roache 1994)"] if by_mesh else []
     return (
         f"The uncertainty of {' and of '.join(parts)} was propagated linearly, from a further solution with each input "
         "changed, and is part of these intervals. The comparison error E = S - D and its standard uncertainties u_num, "

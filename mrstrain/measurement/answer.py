@@ -10,7 +10,7 @@ from dvc import Subject, Verdict
 from dvc.errors import InputError
 from dvc.images.bone_names import is_bones_name
 from dvc.io.result_folder import QUALITY
-from dvc.report.alike import alike
+from dvc.report.alike import alike, listed
 from dvc.report.page import LOPSIDED, Cell, Estimate, Section, Table
 from dvc.trust.error_model import POOLED
 from dvc.trust.quality import NoiseFloor, read_noise_floor
@@ -76,9 +76,7 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
     told += "." if high.interval is None else ", with 95 % intervals in brackets."
     overlapping = [str(row[1]) for other, row in known if row[0] == load and row[1] != tissue and other.reaches(high)]
     if overlapping and high.interval is not None:
-        *others, last = overlapping
-        listed = f"{', '.join(others)} and {last}" if others else last
-        told += f" The 95th percentile may be as large in {listed}, since the intervals overlap."
+        told += f" The 95th percentile may be as large in {listed(overlapping)}, since the intervals overlap."
     if beside.floor is not None:
         noise = f"{beside.floor.max_shear_p50:.3f} (median) and {beside.floor.max_shear_p95:.3f} (95th percentile)"
         told += f" The noise floor is {noise}."

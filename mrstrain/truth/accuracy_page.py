@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from dvc.registration.engines import ENGINES
+from dvc.report.alike import listed
 from dvc.report.drawing import Drawing
 from dvc.report.page import Cell, Picture, Section, Table
 from dvc.trust.error_model import POOLED
@@ -169,15 +170,10 @@ def _sentence(condition: _Condition, errors: Sequence[ErrorRow], floors: Sequenc
             error.append(f"{mean:.3f}{spread} in {tissue}")
     floor = [f"{f.shear_p50:.3f} in {f.tissue}" for f in floors if f.condition == condition and f.tissue in _TISSUES]
     over = f" over {len(motions)} motions, with their range" if len(motions) > 1 else ""
-    told = [f"the max. shear has an error (RMSE{over}) of {_listed(error)}"] if error else []
-    told += [f"the noise floor (median) is {_listed(floor)}"] if floor else []
+    told = [f"the max. shear has an error (RMSE{over}) of {listed(error)}"] if error else []
+    told += [f"the noise floor (median) is {listed(floor)}"] if floor else []
     labels = " (one smooth spline)" if preset == GAUSS_NEWTON else ""
     return f"With {preset}{labels}, voxels of {voxel} mm and SNR {snr:g}, {'; '.join(told)}."
-
-
-def _listed(items: Sequence[str]) -> str:
-    """Items in a sentence: "a, b and c"."""
-    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
 def _over_motions(rows: Sequence[ErrorRow], tissue: str) -> tuple[float | None, float | None, float | None]:
