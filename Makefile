@@ -38,6 +38,9 @@ else
 BIN := $(VENV)/bin
 endif
 
+# Where Python is told to keep no bytecode, each of the many processes would compile the sources of the project anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Both cores to the end: a worker that has nothing left takes tests from the other, and each computes on one thread.
 THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=2
 PYTEST := $(THREADS) $(BIN)/python -m pytest -n 2 --dist worksteal
