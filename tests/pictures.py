@@ -1,4 +1,5 @@
-"""How figures are drawn in tests: `make test` draws coarsely and no PDF, except where a test looks at pictures.
+"""How figures are drawn in tests: `make test` draws coarsely, with parts where they happen to lie, and no PDF, except
+where a test looks at pictures.
 
 Every chart that a test draws is searched for lines that are too pale on white.
 """
@@ -14,22 +15,27 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType
 
-from dvc.report import drawing
+from dvc.report import drawing, page
 
 
 @contextmanager
-def _drawn(dots_per_inch: int, pdf: Callable[[Figure], bytes]) -> Iterator[None]:
+def _drawn(
+    dots_per_inch: int, webp_method: int, layout: Callable[..., None], pdf: Callable[[Figure], bytes]
+) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drawing, "DPI", dots_per_inch)
+        patch.setattr(page, "_METHOD", webp_method)
+        patch.setattr(ConstrainedLayoutEngine, "execute", layout)
         patch.setattr(drawing, "_pdf_bytes", pdf)
         yield
 
 
-coarse_pictures = partial(_drawn, 30, lambda _: b"")
-real_pictures = partial(_drawn, drawing.DPI, drawing._pdf_bytes)
+coarse_pictures = partial(_drawn, 30, 0, lambda *_: None, lambda _: b"%PDF-")
+real_pictures = partial(_drawn, drawing.DPI, page._METHOD, ConstrainedLayoutEngine.execute, drawing._pdf_bytes)
 """As users get them; drawing takes a third of the time of a small registration, and most of a comparison's."""
 
 

@@ -14,7 +14,7 @@ from tests.pictures import pale_lines
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLES = sorted((DOCS / "gallery").glob("*.py"))
-SLOW = {"error_bars"}  # error bars need voxels of full size
+SLOW = {"error_bars", "mesh"}  # error bars need voxels of full size, and the mesh is of a heel of its own
 MOST_BYTES = 40_000
 
 

@@ -381,6 +381,7 @@ def holding(megabytes: int) -> int:
     return os.getpid()
 
 
+@pytest.mark.full_size  # it waits for what loky does now and then
 def test_a_process_that_keeps_memory_is_kept_for_the_next_task():
     with Worker(threads=1) as worker:
         first = worker.run("holding memory", holding, 1)

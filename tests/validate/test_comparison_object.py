@@ -17,7 +17,6 @@ from dvc.report.page import shown
 from dvc.trust.error_model import ErrorTable
 from dvc.trust.verdict import Verdict
 from dvc.worker import side_by_side
-from tests.pictures import real_pictures
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
 from validate.agreement import Agreement, over_loads, regression_told
@@ -43,13 +42,12 @@ def comparison() -> Comparison:
 @pytest.fixture(scope="module")
 def folder(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("compared")
-    with real_pictures():
-        comparison.write(place, on_image=True)
+    comparison.write(place, on_image=True)
     return place
 
 
 @pytest.mark.full_size
-@pytest.mark.usefixtures("real_pictures")  # as in processes of their own
+@pytest.mark.usefixtures("real_pictures")  # as in processes of their own; with all tests, those of the folder too
 def test_loads_compared_in_processes_give_the_same_to_the_bit(comparison: Comparison, folder: Path, tmp_path) -> None:
     with side_by_side("comparing", 2) as each:
         cases, by = [one.case for one in comparison.loads], comparison.loads[0].criteria

@@ -339,7 +339,7 @@ def test_progress_tells_stages_and_rises(tiny_pair, worker):
         tiny_pair.reference,
         tiny_pair.loaded,
         bone=tiny_pair.bone,
-        settings=few(),
+        settings=quick(MaximumNumberOfIterations=("3",)),
         worker=worker,
         progress=lambda stage, fraction: told.append((stage, fraction)),
     )

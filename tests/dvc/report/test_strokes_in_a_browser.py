@@ -70,7 +70,7 @@ def saved(tab: Tab, folder: Path) -> Path:
         old.unlink()
     tab.value("$('save').click()")
     ends, place = time.monotonic() + 30.0, folder / "strokes.nii.gz"
-    while not place.is_file():
+    while not (place.is_file() and place.stat().st_size > 0):  # it is there before its content
         assert time.monotonic() < ends, f"nothing was saved; the console says {tab.said}"
         time.sleep(0.05)
     return place

@@ -89,6 +89,7 @@ def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
     assert not results.failures
 
 
+@pytest.mark.full_size
 def test_a_change_of_volume_that_was_allowed_is_told_and_costs_trust(tiny_pair, tmp_path, monkeypatch):
     """By a limit under which every pair asks for one, in what is made of a result."""
     monkeypatch.setattr("dvc.registration.gauss_newton.choice._ASKED", -1.0)

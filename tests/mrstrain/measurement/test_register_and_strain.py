@@ -35,7 +35,6 @@ from mrstrain.measurement.strain import strain
 from mrstrain.options.measurement import EngineOptions, SubjectFiles
 from mrstrain.options.modelling import ComparisonLabels
 from mrstrain.records.measured_with import MeasuredWith
-from tests.pictures import real_pictures
 from tests.processes import tasks_run_in
 from tests.quick import QUICK
 
@@ -79,7 +78,7 @@ def results(study, worker, computed_once):
         "landmarks": study / "points.csv", "mesh": study / "mesh.vtu", "error_model": study / "errors.json",
         "shear_direction": (0.0, -1.0, 0.0), "workers": 1, "threads": 1, "seed": 5,
     }  # fmt: skip
-    with tasks_run_in(worker), real_pictures():
+    with tasks_run_in(worker):
         return computed_once("results", lambda: register(study / "Load0.nii.gz", [study / "Load1.nii.gz"], **given))
 
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from dvc.images.image import Grid, LabelMap
 from dvc.io.images.write import write_image, write_labels
+from mrstrain.cli.app import app
 from tests.mrstrain.studies import checked_study
+from tests.pictures import real_pictures
 from tests.planted import plant_in_nifti
 from tests.processes import stages_run_here
 
@@ -78,17 +79,13 @@ def images(made_once, tiny_pair, small_pair) -> Path:
 
 @pytest.fixture(scope="module")
 def done(images, made_once, tmp_path_factory):
-    """The study, run once for all in a process of its own on two workers; each test worker has a copy."""
+    """The study, run once for all by its command, and what that printed; each test worker has a copy."""
 
     def fill(folder: Path) -> None:
         shutil.copytree(images, folder / "study")
-        told = subprocess.run(
-            [sys.executable, "-m", "mrstrain", "run", str(folder / "study")],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert told.returncode == 0, told.stderr
+        with stages_run_here(), real_pictures():
+            told = CliRunner().invoke(app, ["run", str(folder / "study")])
+        assert told.exit_code == 0, told.output
         (folder / "told.json").write_text(json.dumps([told.stdout, told.stderr]))
 
     folder = made_once("study-done", fill)

@@ -81,7 +81,7 @@ def computed_s(processes: list[psutil.Process]) -> dict[int, float]:
     return seconds
 
 
-@pytest.mark.parametrize("group", [slow(False, id="process"), pytest.param(True, id="group")])
+@pytest.mark.parametrize("group", [slow(False, id="process"), slow(True, id="group")])
 def test_a_study_ends_and_goes_on(images, tmp_path, group, monkeypatch):
     study, temporary = tmp_path / "study", tmp_path / "temporary"
     temporary.mkdir()

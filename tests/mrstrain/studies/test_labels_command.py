@@ -197,7 +197,7 @@ def test_a_guard_that_is_killed_is_not_taken_for_the_command(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
-@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("by", [pytest.param(signal.SIGINT, marks=pytest.mark.full_size), signal.SIGKILL])
 def test_a_study_that_is_ended_leaves_no_segmenter(folder, by):
     segmenter = "sh -c 'sleep 1000 & echo $! $$ > processes; sleep 1000' {image} {labels}"
     write_image(folder / "Load1.nii.gz", read_image(folder / "Load0.nii.gz"))
