@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
 import jinja2
 
-from dvc import read_image, read_labels
+from dvc import read_image, read_labels, read_mask
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, OutputError, few
 from dvc.file_names import as_typed
@@ -198,8 +199,12 @@ def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
         )
         others = {load: read_image(place / image, allow_missing=True) for load, image in found.loads.items()}
         names = [] if labels is None else [name for number, name in labels.names.items() if number != 0]
+        shown = Labelled.of(unloaded, labels)
+        if labels is None and found.bone_mask is not None:
+            with suppress(InputError):  # `check` tells what is wrong with it
+                shown = Labelled(unloaded, {BONE: read_mask(place / found.bone_mask, unloaded.grid).inside})
         with whole_file(place / PICTURE) as file:
-            file.write_bytes(png_bytes(overview(Labelled.of(unloaded, labels), others)))
+            file.write_bytes(png_bytes(overview(shown, others)))
     except InputError as error:
         return f"none, {error}", []
     return place / PICTURE, names

@@ -1,4 +1,4 @@
-"""The picture that `init` draws: the unloaded image with its labels in colour, and every other image beside it."""
+"""The picture that `init` draws: the unloaded image with its labels, or the bone, in colour, and the others beside."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ class Labelled:
 
 
 def overview(unloaded: Labelled, others: Mapping[str, Image]) -> Figure:
-    """Middle slices of the unloaded image in three planes with its labels in colour, and one of every other.
+    """Middle slices of the unloaded image in three planes with its labels or bone in colour, and one of every other.
 
     The slices meet in the middle of what is labelled, or of the image; letters are sides of the body.
     """

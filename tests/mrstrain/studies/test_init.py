@@ -265,6 +265,19 @@ def test_a_picture_shows_what_was_found(tmp_path, tiny_pair):
         assert (np.abs(pixels - colour).sum(axis=-1) < 30).sum() > 200
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_without_labels_a_picture_shows_the_mask_of_the_bone(tmp_path, tiny_pair, whole):
+    write_image(tmp_path / "Load0.nii.gz", tiny_pair.reference)
+    write_mask(mask := tmp_path / "calcaneus.nii.gz", tiny_pair.labels.region("bone"))
+    if not whole:
+        mask.write_bytes(mask.read_bytes()[:200])
+    begun = init(tmp_path)
+    assert begun.inputs.bone_mask == mask.name
+    with Pixels.open(begun.picture) as picture:
+        r, g, b = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), -1, 0)
+    assert ((np.count_nonzero(b > r + 30) > 2000)) == whole  # blue lies over grey
+
+
 def test_no_picture_is_no_reason_to_write_no_study_file(tmp_path):
     begun = init(folder_of(tmp_path, "Load0.nii.gz", "Load1.nii.gz", "tissues.nii.gz"))
     assert begun.path.is_file()

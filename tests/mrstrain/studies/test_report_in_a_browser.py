@@ -55,6 +55,24 @@ def test_the_report_of_a_study_fits_and_its_text_is_legible(tab, report, width):
     assert tab.said == []
 
 
+def test_tables_of_many_columns_fit_a_laptop_and_a_sheet_of_paper(tab, report):
+    """A table that is wider than the sheet would shrink everything on it, to 71 % once."""
+    opened(tab, report, 1000)
+    tab.value(UNFOLD)
+    assert (
+        tab.value("Math.max(...[...document.querySelectorAll('.wide thead tr')].map((row) => row.children.length))")
+        > 10
+    )
+    assert tab.value("[...document.querySelectorAll('.wide')].filter((one) => one.scrollWidth > one.clientWidth)") == []
+    tab.call("Emulation.setEmulatedMedia", media="print")
+    opened(tab, report, 688)  # of A4, between its margins
+    tab.value(UNFOLD)
+    try:
+        assert tab.value(TOO_WIDE) <= 0
+    finally:
+        tab.call("Emulation.setEmulatedMedia", media="")
+
+
 def test_a_screen_reader_finds_its_way_through_the_report_of_a_study(tab, report):
     opened(tab, report, 1400)
     tab.value(UNFOLD)
