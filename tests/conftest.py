@@ -7,7 +7,6 @@ import hashlib
 import os
 import pickle
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -37,20 +36,11 @@ def _little_to_collect() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _coarse_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """In `make test` alone; `make test-all` draws all figures as users get them."""
-    from tests.pictures import coarse_pictures
+def _pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Blank in `make test`; `make test-all` draws all figures as users get them."""
+    from tests.pictures import blank_pictures, real_pictures
 
-    with coarse_pictures() if "not full_size" in request.config.option.markexpr else nullcontext():
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _charts_checked() -> Iterator[None]:
-    """Every chart that is drawn in this process has lines that can be seen on white."""
-    from tests.pictures import charts_checked
-
-    with charts_checked():
+    with blank_pictures() if "not full_size" in request.config.option.markexpr else real_pictures():
         yield
 
 
@@ -126,6 +116,18 @@ def heel_pair_once(computed_once) -> Callable[..., Any]:
         return computed_once(f"heel {seed} {name}", lambda: heel_pair(seed, **given))
 
     return pair
+
+
+@pytest.fixture(scope="session")
+def heel_at_rest_once(computed_once) -> Callable[..., tuple[Any, Any]]:
+    """A scan of a heel at rest, by its seed and voxels, SNR 25, and its true labels; made once for all tests."""
+    from phantoms import Heel, heel_grid, labels_of, scan
+
+    def made(seed: int, spacing_mm: Any) -> tuple[Any, Any]:
+        heel, grid = Heel(seed), heel_grid(spacing_mm)
+        return scan(heel, grid, snr=25.0, number=0), labels_of(heel, grid)
+
+    return lambda seed, spacing_mm: computed_once(f"rest {seed} {spacing_mm}", lambda: made(seed, spacing_mm))
 
 
 @pytest.fixture(scope="session")

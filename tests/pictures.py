@@ -1,11 +1,11 @@
-"""How figures are drawn in tests: `make test` draws coarsely, with parts where they happen to lie, and no PDF, except
-where a test looks at pictures.
+"""How figures are drawn in tests: `make test` makes them all and draws none, except where a test looks at pictures.
 
-Every chart that a test draws is searched for lines that are too pale on white.
+Every chart that a test makes is searched for lines that are too pale on white.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -18,24 +18,36 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType
+from PIL import Image as Pixels
 
-from dvc.report import drawing, page
+from dvc.report import drawing
 
 
 @contextmanager
-def _drawn(
-    dots_per_inch: int, webp_method: int, layout: Callable[..., None], pdf: Callable[[Figure], bytes]
+def _pictures(
+    drawn: Callable[[Figure], bytes], pdf: Callable[[Figure], bytes], layout: Callable[..., None]
 ) -> Iterator[None]:
+    def checked(figure: Figure) -> bytes:
+        assert not pale_lines(figure), pale_lines(figure)
+        return drawn(figure)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drawing, "DPI", dots_per_inch)
-        patch.setattr(page, "_METHOD", webp_method)
-        patch.setattr(ConstrainedLayoutEngine, "execute", layout)
+        patch.setattr(drawing, "_drawn", checked)
         patch.setattr(drawing, "_pdf_bytes", pdf)
+        patch.setattr(ConstrainedLayoutEngine, "execute", layout)
         yield
 
 
-coarse_pictures = partial(_drawn, 30, 0, lambda *_: None, lambda _: b"%PDF-")
-real_pictures = partial(_drawn, drawing.DPI, page._METHOD, ConstrainedLayoutEngine.execute, drawing._pdf_bytes)
+def _blank(figure: Figure) -> bytes:
+    """A small white picture of a figure's shape."""
+    width, height = figure.get_size_inches()
+    file = io.BytesIO()
+    Pixels.new("RGB", (round(30 * width), round(30 * height)), "white").save(file, "PNG")
+    return file.getvalue()
+
+
+blank_pictures = partial(_pictures, _blank, lambda _: b"%PDF-", lambda *_: None)
+real_pictures = partial(_pictures, drawing._drawn, drawing._pdf_bytes, ConstrainedLayoutEngine.execute)
 """As users get them; drawing takes a third of the time of a small registration, and most of a comparison's."""
 
 
@@ -66,17 +78,3 @@ def pale_lines(figure: Figure) -> list[str]:
 
 def _seen(line: Line2D) -> ColorType:
     return to_rgba(line.get_color(), line.get_alpha())
-
-
-@contextmanager
-def charts_checked() -> Iterator[None]:
-    """Refuse every chart with a line that is hard to see."""
-    png_bytes = drawing.png_bytes
-
-    def checked(figure: Figure) -> bytes:
-        assert not pale_lines(figure), pale_lines(figure)
-        return png_bytes(figure)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drawing, "png_bytes", checked)
-        yield

@@ -84,6 +84,11 @@ def png_bytes(figure: Figure) -> bytes:
     if (layout := figure.get_layout_engine()) is not None:
         layout.execute(figure)  # each file would find the same places again, and draw the figure once more for it
         figure.set_layout_engine(None)
+    return _drawn(figure)
+
+
+def _drawn(figure: Figure) -> bytes:
+    """A figure whose parts have their places as a PNG file's bytes."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
     return file.getvalue()

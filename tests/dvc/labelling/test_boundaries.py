@@ -28,7 +28,7 @@ def off_mm(found: LabelMap, truth: LabelMap, name: str) -> tuple[float, float]:
     return float(off.mean()), float(np.sqrt((off**2).mean()))
 
 
-@pytest.mark.parametrize("by", [-1, pytest.param(0, marks=pytest.mark.full_size), 1])
+@pytest.mark.parametrize("by", [-1, *(pytest.param(by, marks=pytest.mark.full_size) for by in (0, 1))])
 def test_borders_come_out_alike_wherever_they_were_drawn(heel: tuple[Image, LabelMap], by: int) -> None:
     image, truth = heel
     given = misdrawn(truth, by)

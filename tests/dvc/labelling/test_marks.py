@@ -8,7 +8,6 @@ from dvc import Grid, Image, LabelMap, Mask, label_tissues
 from dvc.arrays import BoolArray
 from dvc.errors import InputError
 from dvc.labelling.marks import corrected, grown
-from phantoms import Heel, heel_grid, labels_of, scan
 from tests.dvc.labelling.test_tissues import dice
 
 GRID = Grid((40, 40, 40), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
@@ -31,10 +30,9 @@ def strokes(labels: LabelMap, counts: dict[int, int]) -> LabelMap:
     return LabelMap(labels.grid, drawn, {number: NAMES[number] for number in counts})
 
 
-def test_a_heel_is_labelled_from_ten_strokes() -> None:
-    heel, grid = Heel(31), heel_grid(1.2)
-    truth = labels_of(heel, grid)
-    made = label_tissues(scan(heel, grid, snr=25.0, number=0), marks=strokes(truth, {1: 1, 2: 4, 3: 3, 4: 2}))
+def test_a_heel_is_labelled_from_ten_strokes(heel_at_rest_once) -> None:
+    image, truth = heel_at_rest_once(31, 1.2)
+    made = label_tissues(image, marks=strokes(truth, {1: 1, 2: 4, 3: 3, 4: 2}))
     assert set(made.labels.names.values()) == {"Calcaneus", "fat", "muscle", "skin", "other bone"}
     known = {name: truth.region(name).inside for name in truth.names.values()}
     assert dice(made.labels.region("Calcaneus").inside, known["bone"]) > 0.93
@@ -42,10 +40,9 @@ def test_a_heel_is_labelled_from_ten_strokes() -> None:
     assert dice(made.labels.region("muscle").inside, known["muscle"] | known["tendon"]) > 0.92
 
 
-def test_a_mark_of_a_bone_outside_of_one_is_refused() -> None:
-    heel, grid = Heel(31), heel_grid(2.0)
-    truth = labels_of(heel, grid)
-    image = scan(heel, grid, snr=25.0, number=0)
+def test_a_mark_of_a_bone_outside_of_one_is_refused(heel_at_rest_once) -> None:
+    image, truth = heel_at_rest_once(31, 2.0)
+    grid = truth.grid
     in_fat = LabelMap(grid, (strokes(truth, {2: 1}).labels > 0).astype(int), {1: "talus"})
     with pytest.raises(InputError, match="The mark of talus is not in marrow"):
         label_tissues(image, marks=in_fat)

@@ -149,11 +149,10 @@ def test_a_gap_of_one_thick_slice_in_the_rim_does_not_join_bone_and_soft_tissue(
 
 
 @pytest.fixture(scope="module")
-def labelled() -> tuple[TissueLabels, FloatArray]:
+def labelled(heel_at_rest_once) -> tuple[TissueLabels, FloatArray]:
     """A heel at 1.2 mm, labelled from its bone alone; and its true labels."""
-    heel, grid = Heel(31), heel_grid(1.2)
-    truth = labels_of(heel, grid)
-    return label_tissues(scan(heel, grid, snr=25.0, number=0), truth.region("bone")), truth
+    image, truth = heel_at_rest_once(31, 1.2)
+    return label_tissues(image, truth.region("bone")), truth
 
 
 def test_tissues_of_a_heel(labelled) -> None:
@@ -169,12 +168,13 @@ def test_tissues_of_a_heel(labelled) -> None:
 
 
 @pytest.mark.parametrize("off", [pytest.param(binary_dilation, marks=pytest.mark.full_size), binary_erosion])
-def test_labels_hardly_depend_on_how_large_the_bone_was_drawn(labelled, off: Callable[[BoolArray], BoolArray]) -> None:
+def test_labels_hardly_depend_on_how_large_the_bone_was_drawn(
+    labelled, heel_at_rest_once, off: Callable[[BoolArray], BoolArray]
+) -> None:
     """If the surface stayed at a mask that is a voxel off, 2.4 and 2.9 % of the labels would be others."""
-    made, truth = labelled
-    heel, grid = Heel(31), heel_grid(1.2)
-    image, bone = scan(heel, grid, snr=25.0, number=0), truth.region("bone")
-    mask = Mask(grid, off(bone.inside))
+    (made, truth), (image, _) = labelled, heel_at_rest_once(31, 1.2)
+    bone = truth.region("bone")
+    mask = Mask(bone.grid, off(bone.inside))
     again = label_tissues(image, mask).labels
     assert dice(mask.inside, bone.inside) < 0.92
     assert dice(again.region("bone").inside, bone.inside) > 0.98
@@ -183,11 +183,10 @@ def test_labels_hardly_depend_on_how_large_the_bone_was_drawn(labelled, off: Cal
     assert np.array_equal(label_tissues(image, mask, bone_is_exact=True).labels.region("bone").inside, mask.inside)
 
 
-def test_a_mask_that_is_mirrored_is_told(labelled) -> None:
+def test_a_mask_that_is_mirrored_is_told(heel_at_rest_once) -> None:
     """Its surface was moved to edges of the image before the registration judged it."""
-    heel, grid = Heel(31), heel_grid(1.2)
-    image, bone = scan(heel, grid, snr=25.0, number=0), labelled[1].region("bone")
-    notes = label_tissues(image, Mask(grid, bone.inside[::-1])).notes
+    image, truth = heel_at_rest_once(31, 1.2)
+    notes = label_tissues(image, Mask(truth.grid, truth.region("bone").inside[::-1])).notes
     assert any("The bone mask may be mirrored" in note for note in notes)
 
 

@@ -88,6 +88,7 @@ def test_on_a_narrow_screen_the_strains_come_first_in_two_columns(subject: Subje
     assert unloaded.get_position().x1 < bar.get_position().x0
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_pictures_of_single_loads_get_the_colours_of_the_load_with_most_strain(
     subject: Subject, folders: dict[str, Path]
 ) -> None:

@@ -222,7 +222,7 @@ def test_a_mark_of_few_pixels_keeps_its_colour_in_a_chart() -> None:
     """Between lines of many shades it took the colour of one of them, another model's."""
     figure, panels = chart(2, page_wide=True)
     drawn_on(panels)
-    marks = {"#ff00ff": (255, 0, 255), "#ffee00": (255, 238, 0)}
+    marks = {"#ff00ff": (255, 0, 255), "#bb8800": (187, 136, 0)}
     for axes, colour in zip(panels, marks, strict=True):
         axes.plot([0.5], [90.0], "o", color=colour, ms=2)
     png_file = png_bytes(figure)

@@ -32,15 +32,15 @@ from mrstrain.measurement import label as labelling
 from mrstrain.measurement.strokes import read_marks
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.records.inputs import made_from_image, read_subject
-from phantoms import Heel, heel_grid, labels_of, misdrawn, scan
+from phantoms import Heel, labels_of, misdrawn
 
 
 @pytest.fixture(scope="module")
-def folder(made_once) -> Path:
+def folder(made_once, heel_at_rest_once) -> Path:
     def fill(place: Path) -> None:
-        heel, grid = Heel(41), heel_grid(1.6)
-        write_image(place / "Load0.nii.gz", scan(heel, grid, snr=25.0, number=0))
-        write_mask(place / "bone.nii.gz", labels_of(heel, grid).region("bone"))
+        image, truth = heel_at_rest_once(41, 1.6)
+        write_image(place / "Load0.nii.gz", image)
+        write_mask(place / "bone.nii.gz", truth.region("bone"))
         told = mrstrain.label(place / "Load0.nii.gz", bone=place / "bone.nii.gz", out=place / "made" / "tissues.nii.gz")
         (place / "told.txt").write_text("\n".join(told.summary()))
 
@@ -163,11 +163,13 @@ def test_what_is_corrected_needs_no_mask_and_names_need_labels(folder: Path, tmp
     assert not list(tmp_path.iterdir())
 
 
-def test_another_subjects_labels_are_carried_over_and_counted_as_made(folder: Path, tmp_path: Path) -> None:
+def test_another_subjects_labels_are_carried_over_and_counted_as_made(
+    folder: Path, tmp_path: Path, heel_at_rest_once
+) -> None:
     load0, other, theirs = folder / "Load0.nii.gz", tmp_path / "Other.nii.gz", tmp_path / "theirs.nii.gz"
-    heel, grid = Heel(7), heel_grid(2.4)
-    write_image(other, scan(heel, grid, snr=25.0, number=0))
-    write_labels(theirs, labels_of(heel, grid))
+    image, labels = heel_at_rest_once(7, 2.4)
+    write_image(other, image)
+    write_labels(theirs, labels)
     out = tmp_path / "out" / "tissues.nii.gz"
     told = mrstrain.label(load0, from_image=other, labels=theirs, names=tmp_path / "theirs.csv", out=out)
     assert told.section.title == "Label map made from another subject"
@@ -284,7 +286,7 @@ def test_strokes_that_cannot_correct_a_map_are_refused(folder: Path, tmp_path: P
 
 
 def test_strokes_go_along_with_another_subjects_labels(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, heel_at_rest_once
 ) -> None:
     def asked(*_: object, marks: LabelMap, **__: object) -> TissueLabels:
         assert marks.names == {7: "fat"}
@@ -292,7 +294,7 @@ def test_strokes_go_along_with_another_subjects_labels(
 
     monkeypatch.setattr(labelling, "labels_from", asked)
     other = tmp_path / "other.nii.gz"
-    write_image(other, scan(Heel(7), heel_grid(2.4), snr=25.0, number=0))
+    write_image(other, heel_at_rest_once(7, 2.4)[0])
     strokes(folder, tmp_path / "strokes.seg.nrrd")
     given = {"labels": folder / "made" / "tissues.nii.gz", "names": folder / "made" / "tissues.csv"}
     with pytest.raises(InputError, match="as asked"):

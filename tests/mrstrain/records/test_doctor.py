@@ -170,6 +170,7 @@ def test_what_it_tries_works_here(module: str) -> None:
     assert import_module(module).self_test()
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_registration_that_finds_another_shift_fails_its_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = self_test.register
     monkeypatch.setattr(self_test, "register", lambda fixed, moving, **given: whole(moving, fixed, **given))

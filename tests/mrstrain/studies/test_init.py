@@ -274,8 +274,8 @@ def test_without_labels_a_picture_shows_the_mask_of_the_bone(tmp_path, tiny_pair
     begun = init(tmp_path)
     assert begun.inputs.bone_mask == mask.name
     with Pixels.open(begun.picture) as picture:
-        r, g, b = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), -1, 0)
-    assert ((np.count_nonzero(b > r + 30) > 2000)) == whole  # blue lies over grey
+        r, _, b = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), -1, 0)
+    assert (np.count_nonzero(b > r + 30) > 2000) == whole  # blue lies over grey
 
 
 def test_no_picture_is_no_reason_to_write_no_study_file(tmp_path):
