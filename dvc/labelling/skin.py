@@ -159,40 +159,40 @@ def _fitted(values: FloatArray, weights: FloatArray, voxel_mm: float, whole: "_F
     """Fit profiles (n, depths) above the air: mean over the thicknesses tried, by how likely they are."""
     known = (weights > 0.0).sum(axis=1) >= _LEAST_DEPTHS
     y, w = values[known], weights[known]
-    cost = np.full((len(_THICK_MM), len(y)), np.inf)
-    shift, levels = np.zeros(cost.shape), np.zeros((*cost.shape, 2))
-    total = np.einsum("nd,nd->n", w, y**2)
+    wy, cost = w * y, np.full((len(y), len(_THICK_MM)), np.inf)
+    shift, level_of_skin, level_below = (np.zeros(cost.shape) for _ in range(3))
     usual, hold = (np.zeros(2), 1e-6) if whole is None else (whole.levels[0], _LEVEL_WEIGHT)
+    total = np.einsum("nd,nd->n", wy, y)[:, None] + hold * (usual @ usual)
     for e in _SHIFTS * voxel_mm:
-        outer = ndtr((_DEPTHS_MM - e) / (_BLUR * voxel_mm))
-        for number, thick in enumerate(_THICK_MM):
-            inner = ndtr((_DEPTHS_MM - e - thick) / (_BLUR * voxel_mm))
-            base = np.stack([outer - inner, inner])
-            # Normal equations of the two levels, for all profiles at once.
-            aa, ab, bb = (w @ (base[i] * base[j]) for i, j in ((0, 0), (0, 1), (1, 1)))
-            ya, yb = ((w * y) @ one for one in base)
-            aa, bb, ya, yb = aa + hold, bb + hold, ya + hold * usual[0], yb + hold * usual[1]
-            determinant = aa * bb - ab**2
-            found = np.stack([(bb * ya - ab * yb) / determinant, (aa * yb - ab * ya) / determinant], axis=-1)
-            left = total + hold * (usual @ usual) - found[:, 0] * ya - found[:, 1] * yb
-            better = left < cost[number]
-            cost[number, better], shift[number, better], levels[number, better] = left[better], e, found[better]
+        # Normal equations of the two levels, for all profiles and thicknesses at once.
+        depths = _DEPTHS_MM[:, None] - e
+        b = ndtr((depths - _THICK_MM) / (_BLUR * voxel_mm))
+        a = ndtr(depths / (_BLUR * voxel_mm)) - b
+        aa, ab, bb, ya, yb = w @ a**2 + hold, w @ (a * b), w @ b**2 + hold, wy @ a, wy @ b
+        ya += hold * usual[0]
+        yb += hold * usual[1]
+        determinant = aa * bb - ab**2
+        skin, below = (bb * ya - ab * yb) / determinant, (aa * yb - ab * ya) / determinant
+        left = total - skin * ya - below * yb
+        better = left < cost
+        for kept, new in ((cost, left), (shift, e), (level_of_skin, skin), (level_below, below)):
+            np.copyto(kept, new, where=better)
     # Where no profile fits, such as over bone close to skin, the thickness is that of the whole body.
-    own = cost.min(axis=0) / max(1.0, float(w.sum(axis=1).mean()) - 4.0)
-    odds = cost / (2.0 * np.maximum(own, np.median(own)) + 1e-12)
+    own = cost.min(axis=1) / max(1.0, float(w.sum(axis=1).mean()) - 4.0)
+    odds = cost / (2.0 * np.maximum(own, np.median(own)) + 1e-12)[:, None]
     if whole is not None:
-        odds = odds + 0.5 * ((_THICK_MM - whole.thickness_mm[0]) / _VARIES_MM)[:, None] ** 2
-    likely = np.exp(odds.min(axis=0) - odds)
-    likely /= likely.sum(axis=0)
-    border = shift + _THICK_MM[:, None]
-    mean = (likely * border).sum(axis=0)
-    spread = np.sqrt((likely * (border - mean) ** 2).sum(axis=0))
+        odds += 0.5 * ((_THICK_MM - whole.thickness_mm[0]) / _VARIES_MM) ** 2
+    likely = np.exp(odds.min(axis=1, keepdims=True) - odds)
+    likely /= likely.sum(axis=1, keepdims=True)
+    border = shift + _THICK_MM
+    mean = (likely * border).sum(axis=1)
+    spread = np.sqrt((likely * (border - mean[:, None]) ** 2).sum(axis=1))
 
     def everywhere(some: FloatArray) -> FloatArray:
         out = np.full(len(values), np.nan)
         out[known] = some
         return out
 
-    thickness = (likely * _THICK_MM[:, None]).sum(axis=0)
-    best = np.einsum("tn,tnc->nc", likely, levels)
+    thickness = likely @ _THICK_MM
+    best = np.stack([(likely * level).sum(axis=1) for level in (level_of_skin, level_below)], axis=-1)
     return _Fit(everywhere(mean), everywhere(spread), everywhere(thickness), best)

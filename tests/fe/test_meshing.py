@@ -70,6 +70,7 @@ def test_thinned_borders_are_closed_and_lie_where_they_were() -> None:
         assert (len(thinned(borders, off_mm)[1]) - len(triangles)) * (off_mm - 0.05) < 0
 
 
+@pytest.mark.full_size
 def test_a_tendon_of_few_voxels_keeps_its_volume() -> None:
     """A mesh within its tolerance of smoothed borders takes a tenth from this cord of 3 voxels."""
     labels = half_onion()

@@ -190,14 +190,14 @@ def test_intervals_hold_for_a_motion_that_was_left_out() -> None:
     """Heels err alike and motions do not: what is left out is the motion, so that intervals hold in others."""
     offsets = {"Load1": 0.0, "smooth": 0.02, "sliding": -0.02, "attached-Load1": 0.01, "attached-Load3": -0.01}
     runs = [
-        samples(replace(CASE, motion=motion, seed=seed), sd=0.01, count=20_000, offset=offset)
+        samples(replace(CASE, motion=motion, seed=seed), sd=0.01, count=5_000, offset=offset)
         for motion, offset in offsets.items()
         for seed in (1, 2)
     ]
     (table,) = fit_error_model(runs, "", "").tables
     by_heel = [replace(run, case=replace(run.case, motion="Load1")) for run in runs]
     assert table.widening > 1.3 * fit_error_model(by_heel, "", "").tables[0].widening
-    new = [samples(replace(CASE, motion="other", seed=9), sd=0.01, count=20_000, offset=o) for o in (0.025, -0.025)]
+    new = [samples(replace(CASE, motion="other", seed=9), sd=0.01, count=5_000, offset=o) for o in (0.025, -0.025)]
     (row,) = (r for r in coverage_rows(new, fit_error_model(runs, "", "")) if r.tissue == "fat")
     assert row.statistics_within == 1.0
     as_drawn = fit_error_model(runs, "", "")

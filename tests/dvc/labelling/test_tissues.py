@@ -220,7 +220,8 @@ def test_progress_is_told_to_the_end_and_what_does_not_fit_is_refused() -> None:
         label_tissues(image, whole)
 
 
-@pytest.mark.parametrize("spacing_mm", [pytest.param((1.2, 1.2, 1.2), marks=pytest.mark.full_size), (1.0, 1.0, 2.0)])
+@pytest.mark.full_size
+@pytest.mark.parametrize("spacing_mm", [(1.2, 1.2, 1.2), (1.0, 1.0, 2.0)])
 def test_bones_are_found_where_slices_are_thick(spacing_mm: tuple[float, float, float]) -> None:
     heel, grid = Heel(7), heel_grid(spacing_mm)
     truth = labels_of(heel, grid)

@@ -230,7 +230,7 @@ def test_no_more_than_a_few_truths_are_in_memory_at_once(monkeypatch: pytest.Mon
 
 
 def test_intervals_cover_the_truth_as_often_as_they_claim() -> None:
-    """Truths of images whose bias is their own, 20 times: 95 % intervals miss few; by the mean bias alone, many."""
+    """Truths of images whose bias is their own, 12 times: 95 % intervals miss few; by the mean bias alone, many."""
 
     def cells(bias: float, sd: float) -> dict[str, np.ndarray]:
         return {POOLED: np.stack([np.full((2, 3), bias), np.full((2, 3), sd)])}
@@ -240,7 +240,7 @@ def test_intervals_cover_the_truth_as_often_as_they_claim() -> None:
     table = replace(TABLE, whole=cells(0.01, 0.0316), runs=runs)
     everywhere, far = np.ones(GRID.shape, dtype=bool), np.full(GRID.shape, 9.0, dtype=np.float32)
     hits: list[list[float]] = []
-    for _ in range(20):
+    for _ in range(12):
         base = gaussian_filter(random.standard_normal(GRID.shape), 8.0)
         found = 0.25 + 0.08 * base / base.std()
         noise = gaussian_filter(random.standard_normal(GRID.shape), 2.0)

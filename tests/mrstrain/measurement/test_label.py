@@ -163,6 +163,7 @@ def test_what_is_corrected_needs_no_mask_and_names_need_labels(folder: Path, tmp
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full_size
 def test_another_subjects_labels_are_carried_over_and_counted_as_made(
     folder: Path, tmp_path: Path, heel_at_rest_once
 ) -> None:

@@ -328,15 +328,8 @@ def test_two_parameter_files_of_one_name_are_never_taken_for_each_other(
     assert not accuracy(tmp_path / "out", cases=[cases[1]], workers=1).failures
 
 
-@pytest.mark.parametrize(
-    "preset",
-    [
-        "gauss-newton",
-        pytest.param("quick.txt", marks=pytest.mark.full_size),
-        pytest.param("heel-mr", marks=pytest.mark.full_size),
-        pytest.param("gauss-newton-borders", marks=pytest.mark.full_size),
-    ],
-)
+@pytest.mark.full_size
+@pytest.mark.parametrize("preset", ["gauss-newton", "quick.txt", "heel-mr", "gauss-newton-borders"])
 def test_a_run_is_that_of_its_case(
     preset: str, worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
