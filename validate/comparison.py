@@ -103,8 +103,7 @@ class Comparison:
             ranked = sorted((a for name, a in areas.items() if name not in levelled), key=lambda a: a.best_ml)
             informative = load not in self.ranking.uninformative
             listed = _listed(ranked, nothing, informative)
-            order = "best first" if informative else "not informative"
-            lines.append(f"{load}: {self._area}, mL, {order}: {listed}")
+            lines.append(f"{load}: {self._area}, mL, {'best first' if informative else 'not informative'}: {listed}")
             for name, area in levelled.items():
                 before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
                 lines.append(f"{load}: {name} {area.ml:.2f} by forward-model comparison, {before:.2f} directly")
@@ -243,8 +242,8 @@ class Comparison:
         }  # fmt: skip
         write_json(target / tables.RECORD, own | about)
         closing, title = closing_sections(self.loads[0].criteria.thresholds, methods, more), "Models and measurement"
-        judged, lines = WITH_MODELS if self.warnings else MEASUREMENT, record_lines(about)
         shown, page = [without_banner(first, self.banner), *sections[1:]], target / "report.html"
+        judged, lines = WITH_MODELS if self.warnings else MEASUREMENT, record_lines(about)
         write_report(page, title, self.verdict, shown, closing, lines, judged=judged, models=self.banner)
         return tuple(sections), tuple(closing)
 

@@ -23,6 +23,7 @@ Pairs = tuple[tuple[str, str], ...]
 ALL_LOADS = "all loads"
 _SURE, _LEVEL, _HIGH = 0.95, 0.975, 0.95
 
+_OVER_LOADS = "over all loads"
 CLOSER = 0.95
 """A model is better than `NOTHING` if its area is smaller than this fraction of it."""
 
@@ -93,7 +94,7 @@ def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ())
         caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
         caveat = caveat * bool(distrusted) + _not_trusted(odd)
         strains = loads[0].criteria.strains
-        statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat, strains))
+        statements.insert(0, _statement(_OVER_LOADS, ranked, nothing, pairs[ALL_LOADS], caveat, strains))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs, tuple(uninformative))
 
 
@@ -158,7 +159,7 @@ def _by_percentile(one: LoadComparison) -> str:
     if not models or not measured > 0.0:
         return ""
     first, *others = (f"{_times(high[name] / measured)} times" for name in models)
-    shown = f"95th percentile in all soft tissue: {high[models[0]]:.3f} against {measured:.3f}"
+    shown = f"95th percentile in all soft tissue, as measured: {high[models[0]]:.3f} against {measured:.3f}"
     told = [f"{one.load}: {models[0]} predicts {first} the measured strain ({shown})"]
     told += [f"{name} {times} ({high[name]:.3f})" for name, times in zip(models[1:], others, strict=True)]
     worse = [name for name in models if high[name] >= 2.0 * measured]
@@ -197,6 +198,7 @@ def _statement(
     near = [b for a, b in pairs if a == best.model]
     of_all = f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other."
     between = f"Area between its strain-volume curve and the measured one{over}" if over else "Area"
+    between += ", summed over the loads" * (where == _OVER_LOADS)
     worse = " It is no better than a model without deformation (by 5 %)." * (best.model in no_nearer(ranked, nothing))
     return f"Best match {where} (area metric): {best.model}{of_all} {between}: {area}; {scale}{worse}{caveat}"
 

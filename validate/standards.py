@@ -88,8 +88,8 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
         f"In {tissue}, the largest tissue, the probability that the model represents the measurement is "
         f"{100.0 * best.probability:.0f} % for {best.model} and {100.0 * nothing.probability:.0f} % for no "
         "deformation; similar values mean that this metric does not distinguish them. "
-        f"{best.in_band} of the {best.coefficients} coefficients of {best.model} lie within their uncertainty; "
-        "coefficients count by the size of their error.",
+        f"{best.in_band} of the {best.coefficients} coefficients of {best.model} lie within their uncertainty. "
+        "The probability is lower or higher than their share, since each is weighted by the size of its error.",
         _accepted(best),
         f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "
         f"{100.0 * best.guide_probability:.0f} % for {best.model} and {100.0 * nothing.guide_probability:.0f} % for no "

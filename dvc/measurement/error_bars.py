@@ -180,7 +180,7 @@ def error_bars(
     voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
     other = "" if own == voxel else f" (these images: voxels of {own} mm)"
     told = (
-        f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
+        f"Error model of {chosen.preset}, used for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
         f"{_in_words(chosen.source)}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies "
         "to tissue that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
     )
@@ -189,13 +189,24 @@ def error_bars(
     return ErrorBars(sure, told, used, rows, _of_twin(rows, twin), beyond)
 
 
+_WORDS = {
+    r", seeds \[[^]]*\]": "",
+    r"attached-(\w+)": r"\1 with tissue attached to bone",
+    r"too large by -1, \+0, \+1 voxels": "exact or one voxel too small or too large",
+    r"widened by (\d+) pairs that finite-element models move": r"widened by factors from \1 image pairs moved by "
+    "finite-element models",
+}
+
+
 def _in_words(source: str) -> str:
     """What an error model was measured on, without what only repeats it, and with motions in words.
 
     >>> _in_words("54 registrations of phantom heels, seeds [9000, 9001], motions Load1, attached-Load1")
     '54 registrations of phantom heels, motions Load1, Load1 with tissue attached to bone'
     """
-    return re.sub(r"attached-(\w+)", r"\1 with tissue attached to bone", re.sub(r", seeds \[[^]]*\]", "", source))
+    for found, words in _WORDS.items():
+        source = re.sub(found, words, source)
+    return source
 
 
 def _wider(rows: Sequence[Judged]) -> dict[str, float]:
@@ -240,10 +251,10 @@ def _held(table: ErrorTable) -> str:
         return "The coverage of these intervals is not known: the error model rests on a single registration."
     factors = {f"{factor:.1f}" for factor in (table.widening_of or {"": table.factor}).values()}
     times = " to ".join(dict.fromkeys((min(factors, key=float), max(factors, key=float))))
-    share, where = 95, "the parts of the study left out"
+    share, where = "95 %", "the parts of the study left out"
     if table.widening_of:
-        share, where = 97, "image pairs moved by finite-element solutions"
-    return f"Intervals are widened by a factor of {times}, to contain {share} % of the true values in {where}."
+        share, where = "97 % (95 % and a margin for other motions)", "image pairs moved by finite-element solutions"
+    return f"Intervals are widened by a factor of {times}, to contain {share} of the true values in {where}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:

@@ -221,14 +221,23 @@ def _sizes(value: object) -> str | None:
 
 def _weights(quality: Record) -> str | None:
     """The weights that were used, each with what it penalises; an engine without weights has its spline alone."""
-    weights = _mapping(_mapping(quality.get("regularisation")).get("weights"))
+    regularisation = _mapping(quality.get("regularisation"))
+    weights = _mapping(regularisation.get("weights"))
     if not weights:
         return _SPLINE_ALONE if "control_spacing_mm" in _mapping(quality.get("alignment")) else None
+    told = {name: name.replace("_", " ") for name in weights}
+    if of := regularisation.get("rigidity_of"):
+        told["rigidity"] = f"strain of the {of}"
     return ", ".join(
-        f"{name.replace('_', ' ')} {value:g} {_WEIGHTS.get(name, '')}".rstrip()
+        f"{told[name]} {_digits(value)} {_WEIGHTS.get(name, '')}".rstrip()
         for name, value in weights.items()
         if isinstance(value, int | float) and value
     )
+
+
+def _digits(value: float) -> str:
+    """Three digits, or all before the point."""
+    return f"{value:.3g}" if value < 100.0 else f"{value:.0f}"
 
 
 def _mapping(value: object) -> Record:

@@ -120,8 +120,8 @@ class SubjectFiles(BoneAndBody):
     """What is known of the unloaded image: its bone, body and tissues."""
 
     bone: Path | None = None
-    """Mask of the bone on the unloaded image; the rigid motion of this bone is removed. In `register --labels auto`,
-    its surface is moved to the dark rim of the bone."""
+    """Mask of the bone on the unloaded image; the rigid motion of this bone is removed. With --labels auto, or
+    without labels, `register` moves its surface to the dark rim of the bone."""
     bone_label: str | None = None
     """Name of the bone in --labels, instead of --bone."""
     labels: Path | None = None

@@ -180,7 +180,7 @@ def test_slope_and_r2_of_the_best_match_are_told_at_once(comparison: Comparison,
     best = comparison.ranking.areas[0].model
     rows = [a for a in comparison.agreements if (a.model, a.quantity, a.part) == (best, "u_mm", ALL)]
     each = ", ".join(f"{a.slope:.2f} ({a.r2:.2f}) under {a.load}" for a in rows)
-    told = f"Cell by cell, {best} (best by area) on the measurement, slope (R²): displacement {each}"
+    told = f"Cell-by-cell regression of {best} (best by area) on the measurement, slope (R²): displacement {each}"
     assert len({a.slope for a in rows} | {a.r2 for a in rows}) > 1
     page, summary = (folder / "report.html").read_text(), comparison.summary()
     first = summary.index(comparison.ranking.statements[0])
@@ -200,7 +200,9 @@ def test_each_load_has_its_slope_and_uniform_fields_have_none() -> None:
 
     one = [row("Load1", "max_shear", 0.414, 0.094), row("Load1", "max_shear", 0.9, 0.9, "fat")]
     told = regression_told(one, "a")
-    assert told.startswith("Cell by cell, a on the measurement, slope (R²): max. shear 0.41 (0.09). Slope and")
+    assert told.startswith(
+        "Cell-by-cell regression of a on the measurement, slope (R²): max. shear 0.41 (0.09). Slope and"
+    )
     both = [
         *one,
         row("Load1", "u_mm", -0.2, 0.7),

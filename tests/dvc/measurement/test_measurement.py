@@ -253,7 +253,7 @@ def test_images_that_were_aligned_as_a_whole_have_no_figures_of_a_bone(stretched
     assert "bone" not in rows["image"]
     assert stretched.drawings()["strain"].caption.endswith(
         "Slices through the middle of the tissue. The scale ends at 0.1: the 99th percentile of the measured strain, "
-        "rounded up to a multiple of 0.05, from 0.05 to 0.5. Larger values have the last colour."
+        "rounded up to a multiple of 0.05, but at least 0.05 and at most 0.5. Larger values have the last colour."
     )
 
 

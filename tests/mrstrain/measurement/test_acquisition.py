@@ -33,7 +33,7 @@ def folder_of(
     known = {"max_shear_p50": 0.0147, "max_shear_p95": 0.0317, "maer": 0.0065, "sder": 0.0038}
     weights = {"bending": 3.0, "volume": 300.0, "rigidity": 1000.0, "volume_gradient": 0.0}
     quality = {"noise_floor": known if floor else None, "alignment": {"control_spacing_mm": [3.2, 3.2, 3.2]},
-               "regularisation": {"weights": weights}}  # fmt: skip
+               "regularisation": {"weights": weights, "rigidity_of": "bone"}}  # fmt: skip
     (folder / "quality.json").write_text(json.dumps(quality))
     return folder
 
@@ -59,7 +59,7 @@ def test_each_value_has_its_source_and_what_nobody_tells_is_not_given(tmp_path: 
         "median 0.0147, 95th percentile 0.0317; MAER 0.0065, SDER 0.0038", "repeat scan",
     )  # fmt: skip
     assert rows["Control point spacing of the displacement, mm"] == ("3.2 x 3.2 x 3.2", "registration")
-    assert rows["Regularisation weights"][0] == "bending 3 1/mm, volume 300 1/mm³, rigidity 1000 1/mm³"
+    assert rows["Regularisation weights"][0] == "bending 3 1/mm, volume 300 1/mm³, strain of the bone 1000 1/mm³"
     assert rows["Spatial resolution of the strain"] == (NOT_GIVEN, "")
 
 
