@@ -88,7 +88,7 @@ def register(
 
 @takes_options
 def strain(
-    reference: Annotated[Path, typer.Argument(help="Unloaded image; strain is computed on its voxels.")],
+    load0: Annotated[Path, typer.Argument(help="Unloaded image; strain is computed on its voxels.")],
     deformation: Annotated[
         Path, typer.Argument(help="elastix transform .txt, ITK transform (.h5, .tfm), or a displacement image.")
     ],
@@ -96,7 +96,7 @@ def strain(
 ) -> None:  # fmt: skip
     """Compute strain maps from a transform or displacement field of any registration program."""
     given = mrstrain.strain.with_options
-    tell(given(reference, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto))
+    tell(given(load0, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto))
 
 
 @takes_options

@@ -27,14 +27,14 @@ def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
 
 @door
 def strain(
-    reference: Path | str, deformation: Path | str, *, out: Path | str, subject_files: ExistingFiles,
+    load0: Path | str, deformation: Path | str, *, out: Path | str, subject_files: ExistingFiles,
     frame: Frame | None = None, onto: MeshAndAxes,
 ) -> Series:  # fmt: skip
     """Strain maps of a deformation that another tool measured.
 
     Parameters
     ----------
-    reference : path
+    load0 : path
         Unloaded image (reference configuration): gives the voxels.
     deformation : path
         An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with tissue
@@ -53,7 +53,7 @@ def strain(
         Before anything is written: if a file cannot be read or does not fit, or ``out`` would replace an input.
     """
     target, source = Path(out), Path(deformation)
-    subject = read_subject(reference, subject_files, onto)
+    subject = read_subject(load0, subject_files, onto)
     parameters = {
         "frame": frame, "bone_label": subject_files.bone_label, "plate_normal_lps": subject.plate_normal.tolist(),
         "shear_direction_lps": onto.plain()["shear_direction"], **onto.model_dump(include={"mesh_unit", "mesh_frame"}),
