@@ -28,8 +28,14 @@ _USED = 0.7, 1.4  # stretches of tissue under a plate
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
+def _isihara(c10_mpa: float, c20_mpa: float, nu: float = 0.4999) -> Yeoh:
+    return Yeoh.of(c10_mpa, c20_mpa, nu=nu)
+
+
 _Constructor = Callable[..., Material]  # its parameters are the keys of the file; stresses end in _mpa
-_LAWS: Mapping[str, _Constructor] = {"neo-Hooke": NeoHooke.of, "Yeoh": Yeoh.of, "linear elastic": Hencky.of}
+_LAWS: Mapping[str, _Constructor] = {
+    "neo-Hooke": NeoHooke.of, "Isihara": _isihara, "Yeoh": Yeoh.of, "Hencky": Hencky.of, "linear elastic": Hencky.of
+}  # as `fit --law` calls them, and as publications call Hencky's  # fmt: skip
 _OGDEN: Mapping[str, _Constructor] = {
     "ansys": Ogden.from_ansys, "abaqus": Ogden.from_abaqus, "febio": Ogden.from_febio
 }  # by convention  # fmt: skip

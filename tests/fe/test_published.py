@@ -146,6 +146,22 @@ def test_own_sets_in_all_forms(tmp_path: Path) -> None:
 GOOD = 'law = "neo-Hooke"\nmu_kpa = 100\nnu = 0.49\n'
 
 
+def test_models_have_the_names_that_fits_give_them(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text(
+        '[a.fat]\nlaw = "Isihara"\nc10_kpa = 8\nc20_kpa = 2\nnu = 0.49\n'
+        '[a.skin]\nlaw = "Yeoh"\nc10_kpa = 8\nc20_kpa = 2\nnu = 0.49\n'
+        '[a.muscle]\nlaw = "Hencky"\nmu_kpa = 30\nnu = 0.49\n'
+        '[a.tendon]\nlaw = "linear elastic"\nmu_kpa = 30\nnu = 0.49\n'
+    )
+    models = material_set(tmp_path / "own.toml").materials
+    for one, other in (("fat", "skin"), ("muscle", "tendon")):
+        assert models[one].vector.tolist() == models[other].vector.tolist()
+        assert models[one].law == models[other].law
+    (tmp_path / "own.toml").write_text('[a.fat]\nlaw = "Isihara"\nc10_kpa = 8\nc20_kpa = 2\nc30_kpa = 1\nnu = 0.49\n')
+    with pytest.raises(InputError, match="Isihara has no parameter 'c30_kpa'"):
+        material_set(tmp_path / "own.toml")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -154,7 +170,10 @@ GOOD = 'law = "neo-Hooke"\nmu_kpa = 100\nnu = 0.49\n'
         ("mu = 1\n", "'mu' does not belong to a set"),
         ('[a]\ntitle = "x"\n', "has no tissue"),
         ("[a]\nfat = 3\n", "a tissue must be a table"),
-        ("[a.fat]\nmu_kpa = 1\n", "law must be one of neo-Hooke, Yeoh, linear elastic, Ogden; got None"),
+        (
+            "[a.fat]\nmu_kpa = 1\n",
+            "law must be one of neo-Hooke, Isihara, Yeoh, Hencky, linear elastic, Ogden; got None",
+        ),
         ('[a.fat]\nlaw = "Ogden"\nmu_kpa = 1\nalpha = 2\nnu = 0.4\n', "needs convention = 'ansys' or 'abaqus' or"),
         ("[a.fat]\nconvention = 'ansys'\n" + GOOD, "'convention' is only for Ogden models"),
         ("[a.fat]\n" + GOOD.replace("mu_kpa", "mu"), "'mu' needs its unit: mu_kpa or mu_mpa"),
