@@ -16,19 +16,9 @@ from dvc.errors import InputError, few
 from dvc.file_names import refuse_as_file_name
 from dvc.own_files import read_json
 from dvc.report.drawing import png_bytes
-from dvc.report.page import (
-    MEASUREMENT,
-    WITH_MODELS,
-    Banner,
-    Picture,
-    Section,
-    Table,
-    notebook_html,
-    record_lines,
-    write_report,
-)
+from dvc.report.page import Banner, Picture, Section, Table, notebook_html, record_lines, write_report
 from dvc.report.strips import Strip
-from dvc.trust.verdict import LEVELS, worst
+from dvc.trust.verdict import worst
 from dvc.worker import Each
 from validate import figures, report, tables
 from validate.agreement import Agreement, SkinDisplacement, regression_told
@@ -46,6 +36,7 @@ from validate.misfit import Misfit, check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import Drawn, area_rows, closing_sections, drawings_of_all, load_sections, overview, shown
 from validate.tables import Curve
+from validate.verdict import judged_by, verdict_on
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +86,7 @@ class Comparison:
 
     def summary(self) -> list[str]:
         """Verdict, areas, best match, its slope and R², and significant differences, one line each."""
-        lines = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}"]
+        lines = [] if self.verdict is None else [f"{self._judged}: {self.verdict.words}"]
         for load in self.coverage_ml:
             areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL)}
             nothing = areas.pop(NOTHING)
@@ -124,8 +115,12 @@ class Comparison:
         interval = " (95 % interval)" if any(np.isfinite(area.low_ml) for area in self.areas) else ""
         title = f"Area between strain-volume curves, {range_told(self.strains)}, mL{interval}"
         picture = Picture("Strain-volume curves", "", png_bytes(self.plot()))
-        words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}.", *self.verdict.reasons]
+        words = [] if self.verdict is None else [f"{self._judged}: {self.verdict.words}.", *self.verdict.reasons]
         return notebook_html(self.headline, picture, Table(title, head, rows), notes=words)
+
+    @property
+    def _judged(self) -> str:
+        return judged_by(self.verdict, self.verdicts)
 
     @property
     def statements(self) -> tuple[str, ...]:
@@ -243,8 +238,8 @@ class Comparison:
         write_json(target / tables.RECORD, own | about)
         closing, title = closing_sections(self.loads[0].criteria.thresholds, methods, more), "Models and measurement"
         shown, page = [without_banner(first, self.banner), *sections[1:]], target / "report.html"
-        judged, lines = WITH_MODELS if self.warnings else MEASUREMENT, record_lines(about)
-        write_report(page, title, self.verdict, shown, closing, lines, judged=judged, models=self.banner)
+        lines = record_lines(about)
+        write_report(page, title, self.verdict, shown, closing, lines, judged=self._judged, models=self.banner)
         return tuple(sections), tuple(closing)
 
     @classmethod
@@ -355,26 +350,6 @@ def compare(
         verdict=verdict, verdicts=verdicts, notes=(*notes, *_doubts(verdict), *limitations(loads)),
         warnings=tuple(odd), loads=tuple(loads), errors=tuple(error for one in loads for error in one.errors),
     )  # fmt: skip
-
-
-def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[Misfit] = ()) -> Verdict | None:
-    """The verdict on the inputs: the worst of the registrations' (by load) and of warnings on models; None without any.
-
-    It lists the reasons of all verdicts below Trust, the worst first.
-    """
-    verdicts = [odd.verdict for odd in warnings]
-    for load, verdict in measured.items():
-        if verdict is not None:
-            reasons = tuple(f"{load}, registration ({verdict.words}): {reason}" for reason in verdict.reasons)
-            verdicts.append(Verdict(verdict.level, () if verdict.level == "trust" else reasons))
-    if not verdicts:
-        return None
-    distrust, caution = ([r for v in verdicts if v.level == level for r in v.reasons] for level in LEVELS[:0:-1])
-    registrations = {1: "The registration", 2: "Both registrations"}.get(
-        len(verdicts), f"All {len(verdicts)} registrations"
-    )
-    sound = f"{registrations} passed all checks. This is a verdict on the measurement; the models are judged below."
-    return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 
 def _doubts(verdict: Verdict | None) -> tuple[str, ...]:

@@ -86,7 +86,7 @@ def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ())
     many = len(loads) > 1 and bool(ranked) and informative is not None
     weak = [one for one in loads if one.hardly_strained]
     statements = [_under(one, pairs[one.load], odd, many) for one in loads if one not in weak]
-    # First what a model predicts under the load with most strain, as a report shows two paragraphs above its pictures.
+    # First what a model predicts under the load with most strain: a report shows few paragraphs above its pictures.
     statements += [_by_percentile(one) for one in sorted(weak, key=lambda one: -_high(one, "measured"))]
     statements += [_under(one, pairs[one.load], odd, many) for one in weak]
     if many:
@@ -159,7 +159,7 @@ def _by_percentile(one: LoadComparison) -> str:
     if not models or not measured > 0.0:
         return ""
     first, *others = (f"{_times(high[name] / measured)} times" for name in models)
-    shown = f"95th percentile in all soft tissue, as measured: {high[models[0]]:.3f} against {measured:.3f}"
+    shown = f"95th percentile in all soft tissue: {high[models[0]]:.3f} against {measured:.3f} measured, bias included"
     told = [f"{one.load}: {models[0]} predicts {first} the measured strain ({shown})"]
     told += [f"{name} {times} ({high[name]:.3f})" for name, times in zip(models[1:], others, strict=True)]
     worse = [name for name in models if high[name] >= 2.0 * measured]

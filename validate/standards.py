@@ -89,7 +89,7 @@ def answer(one: LoadComparison) -> tuple[str, ...]:
         f"{100.0 * best.probability:.0f} % for {best.model} and {100.0 * nothing.probability:.0f} % for no "
         "deformation; similar values mean that this metric does not distinguish them. "
         f"{best.in_band} of the {best.coefficients} coefficients of {best.model} lie within their uncertainty. "
-        "The probability is lower or higher than their share, since each is weighted by the size of its error.",
+        "The probability can differ from this share, because coefficients are weighted by the size of their error.",
         _accepted(best),
         f"CWA 16799 gives one uncertainty to all coefficients; with it, the probability is "
         f"{100.0 * best.guide_probability:.0f} % for {best.model} and {100.0 * nothing.guide_probability:.0f} % for no "

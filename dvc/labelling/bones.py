@@ -9,12 +9,13 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 _BLUR_MM = 0.5
 _CORE_MM = 2.5  # from what is dark, and more than a slice: narrower gaps in a rim do not join bone and soft tissue
 _LEAST_ML = 0.1  # of a core
-# Of what is dark, tried: voxels as wide as a rim mix it with its bright sides, so a gap in it lets bone run into soft
-# tissue. Muscle, a third brighter than what is dark, must not count as such, or fat between muscles would be a bone.
-_BRIGHTER = (1.0, 1.2, 1.3)
-_MORE = 1.1  # of the volume of bones, for a brighter limit to be taken
+# Limits of what is dark that are tried, over the one given: voxels as wide as a rim mix it with its bright sides, so a
+# gap in it lets bone run into soft tissue. Under the last, dim muscle counts as dark, and fat in it has a closed rim,
+# but one that is not as dark as the limit given; at least this share of a bone's rim is.
+_LIMITS, _DARK_SHARE = (1.0, 1.2, 1.3), 0.6
+_MORE = 1.1  # times what is known of a bone, for it to get what a brighter limit finds there
 _RIM_MM = 1.5  # thickness of a dark rim beyond its darkest part, at most
-_DARK_RIM = 0.6  # brightness of a rim over that of its darker side; .37 to .52 for bones, .8 or more for soft tissue
+_DARK_RIM = 0.6  # brightness of a rim over that of its darker side; .37 to .59 for bones, .66 or more for soft tissue
 
 
 def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: FloatArray) -> IntArray:
@@ -37,10 +38,8 @@ def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: Fl
     """
     blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
     found = np.zeros(where.shape, dtype=np.int64)
-    for brighter in _BRIGHTER:
-        regions = _inner_bones(blurred, where, brighter * dark, spacing_mm)
-        if np.count_nonzero(regions) > _MORE * np.count_nonzero(found):
-            found = regions
+    for limit in _LIMITS:
+        _add(found, _inner_bones(blurred, where, limit * dark, dark, spacing_mm))
     if not found.any():
         return found
     away, nearest = distance_transform_edt(found == 0, sampling=spacing_mm, return_indices=True)
@@ -51,9 +50,22 @@ def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: Fl
     return np.asarray(bones, dtype=np.int64)
 
 
-def _inner_bones(blurred: Float32Array, where: BoolArray, dark: float, spacing_mm: FloatArray) -> IntArray:
+def _add(found: IntArray, others: IntArray) -> None:
+    """Add bones where none was found yet, and to those of which others hold clearly more."""
+    for number in range(1, int(others.max()) + 1):
+        inside = others == number
+        known = np.bincount(found[inside])
+        known[0] = 0
+        own = int(known.argmax())
+        if np.count_nonzero(inside) > _MORE * known.sum():
+            found[inside & (found == 0)] = own or found.max() + 1
+
+
+def _inner_bones(
+    blurred: Float32Array, where: BoolArray, limit: float, dark: float, spacing_mm: FloatArray
+) -> IntArray:
     """Bones up to the darkest places of their rims, numbered from 1; 0 elsewhere."""
-    lit = where & (blurred > dark)
+    lit = where & (blurred > limit)
     parts, count = label(distance_transform_edt(lit, sampling=spacing_mm) > max(_CORE_MM, float(spacing_mm.max())))
     sizes_ml = np.bincount(parts.ravel(), minlength=count + 1) * float(np.prod(spacing_mm)) / 1000.0
     sizes_ml[0] = 0.0
@@ -63,26 +75,29 @@ def _inner_bones(blurred: Float32Array, where: BoolArray, dark: float, spacing_m
     numbers = np.zeros(count + 1, dtype=np.int64)
     numbers[large[np.argsort(-sizes_ml[large])]] = np.arange(1, large.size + 1)  # 1 is the soft tissue
     regions = watershed(-blurred, numbers[parts], mask=where)
-    dark_rim = _rim_brightness(regions, blurred) < _DARK_RIM
-    dark_rim[:2] = False
-    return np.asarray(np.where(dark_rim, np.cumsum(dark_rim), 0)[regions], dtype=np.int64)
+    brightness, share = _rims(regions, blurred, dark)
+    is_bone = (brightness < _DARK_RIM) & (share > _DARK_SHARE)
+    is_bone[:2] = False
+    return np.asarray(np.where(is_bone, np.cumsum(is_bone), 0)[regions], dtype=np.int64)
 
 
-def _rim_brightness(regions: IntArray, values: Float32Array) -> FloatArray:
-    """Mean brightness where each region meets others, over the median of the darker of the two regions.
+def _rims(regions: IntArray, values: Float32Array, dark: float) -> tuple[FloatArray, FloatArray]:
+    """Rims, where regions meet: mean brightness over the median of the darker of the two, and the share that is dark.
 
-    By the number of the region; infinite for one that meets no other.
+    By the number of the region; infinite and 0 for one that meets no other.
     """
     count = int(regions.max()) + 1
     usual = np.concatenate([[np.inf], median(values, regions, np.arange(1, count))])
-    total, faces = np.zeros((2, count))
+    total, faces, dim = np.zeros((3, count))
     for axis in range(regions.ndim):
         one, other = np.moveaxis(regions, axis, 0)[1:], np.moveaxis(regions, axis, 0)[:-1]
         at = (one != other) & (one > 0) & (other > 0)
         lines = np.moveaxis(values, axis, 0)
-        sides = one[at], other[at]
-        shade = np.minimum(lines[1:][at], lines[:-1][at]) / np.minimum(usual[sides[0]], usual[sides[1]])
+        sides, lowest = (one[at], other[at]), np.minimum(lines[1:][at], lines[:-1][at])
+        shade = lowest / np.minimum(usual[sides[0]], usual[sides[1]])
         for side in sides:
             total += np.bincount(side, shade, count)
+            dim += np.bincount(side, lowest < dark, count)
             faces += np.bincount(side, minlength=count)
-    return np.where(faces > 0, total / np.maximum(faces, 1), np.inf)
+    meets = np.maximum(faces, 1)
+    return np.where(faces > 0, total / meets, np.inf), dim / meets

@@ -19,6 +19,7 @@ _WIDE_MM = 5.0  # standard deviation of the neighbourhood whose profile is fitte
 _BLOCK_MM = 2.5
 _VARIES_MM = 0.4  # standard deviation of the thickness over the body
 _LEVEL_WEIGHT = 0.02  # of what the levels are in the whole body, as a share of a profile
+_AT_ONCE = 8192  # profiles: for memory
 _AWAY = 4  # voxels from the body: only air
 _LEAST_DEPTHS = 5  # with values, of a profile: more than what is fitted
 _LEAST_CONTRAST = 0.15  # between skin and what is below it, as a share of the brightness of the latter
@@ -159,6 +160,34 @@ def _fitted(values: FloatArray, weights: FloatArray, voxel_mm: float, whole: "_F
     """Fit profiles (n, depths) above the air: mean over the thicknesses tried, by how likely they are."""
     known = (weights > 0.0).sum(axis=1) >= _LEAST_DEPTHS
     y, w = values[known], weights[known]
+    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(y), _AT_ONCE)]
+    found = [_best_levels(y[part], w[part], voxel_mm, whole) for part in parts]
+    cost, shift, *levels = (np.concatenate(each) for each in zip(*found, strict=True))
+    # Where no profile fits, such as over bone close to skin, the thickness is that of the whole body.
+    own = cost.min(axis=1) / max(1.0, float(w.sum(axis=1).mean()) - 4.0)
+    odds = cost / (2.0 * np.maximum(own, np.median(own)) + 1e-12)[:, None]
+    if whole is not None:
+        odds += 0.5 * ((_THICK_MM - whole.thickness_mm[0]) / _VARIES_MM) ** 2
+    likely = np.exp(odds.min(axis=1, keepdims=True) - odds)
+    likely /= likely.sum(axis=1, keepdims=True)
+    border = shift + _THICK_MM
+    mean = (likely * border).sum(axis=1)
+    spread = np.sqrt((likely * (border - mean[:, None]) ** 2).sum(axis=1))
+
+    def everywhere(some: FloatArray) -> FloatArray:
+        out = np.full(len(values), np.nan)
+        out[known] = some
+        return out
+
+    thickness = likely @ _THICK_MM
+    best = np.stack([(likely * level).sum(axis=1) for level in levels], axis=-1)
+    return _Fit(everywhere(mean), everywhere(spread), everywhere(thickness), best)
+
+
+def _best_levels(
+    y: FloatArray, w: FloatArray, voxel_mm: float, whole: "_Fit | None"
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of profiles with their weights, for each thickness: cost, shift of the surface, level of skin and below it."""
     wy, cost = w * y, np.full((len(y), len(_THICK_MM)), np.inf)
     shift, level_of_skin, level_below = (np.zeros(cost.shape) for _ in range(3))
     usual, hold = (np.zeros(2), 1e-6) if whole is None else (whole.levels[0], _LEVEL_WEIGHT)
@@ -177,22 +206,4 @@ def _fitted(values: FloatArray, weights: FloatArray, voxel_mm: float, whole: "_F
         better = left < cost
         for kept, new in ((cost, left), (shift, e), (level_of_skin, skin), (level_below, below)):
             np.copyto(kept, new, where=better)
-    # Where no profile fits, such as over bone close to skin, the thickness is that of the whole body.
-    own = cost.min(axis=1) / max(1.0, float(w.sum(axis=1).mean()) - 4.0)
-    odds = cost / (2.0 * np.maximum(own, np.median(own)) + 1e-12)[:, None]
-    if whole is not None:
-        odds += 0.5 * ((_THICK_MM - whole.thickness_mm[0]) / _VARIES_MM) ** 2
-    likely = np.exp(odds.min(axis=1, keepdims=True) - odds)
-    likely /= likely.sum(axis=1, keepdims=True)
-    border = shift + _THICK_MM
-    mean = (likely * border).sum(axis=1)
-    spread = np.sqrt((likely * (border - mean[:, None]) ** 2).sum(axis=1))
-
-    def everywhere(some: FloatArray) -> FloatArray:
-        out = np.full(len(values), np.nan)
-        out[known] = some
-        return out
-
-    thickness = likely @ _THICK_MM
-    best = np.stack([(likely * level).sum(axis=1) for level in (level_of_skin, level_below)], axis=-1)
-    return _Fit(everywhere(mean), everywhere(spread), everywhere(thickness), best)
+    return cost, shift, level_of_skin, level_below

@@ -147,11 +147,6 @@ def label_tissues(
             "Where fat is marked, the image is not brighter than where muscle is marked. Check the names of the "
             "strokes; if fat is suppressed, give an image in which it is bright."
         )
-    if sum(map(is_bones_name, chance)) < 2:
-        notes.append(
-            "No bone was found but the one that was given. If the image shows others, they are labelled as fat: paint "
-            "them in the label map."
-        )
     if "muscle" not in chance:
         notes.append(
             "Fat and muscle could not be separated by intensity: only one tissue was found below the skin. Strokes in "

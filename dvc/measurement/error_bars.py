@@ -180,7 +180,7 @@ def error_bars(
     voxel, own = (" x ".join(f"{s:.2g}" for s in sorted(edges)) for edges in (table.spacing_mm, larger))
     other = "" if own == voxel else f" (these images: voxels of {own} mm)"
     told = (
-        f"Error model of {chosen.preset}, used for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
+        f"Error model of {chosen.preset}, its table for voxels of {voxel} mm at SNR {table.snr:.0f}{other}: "
         f"{_in_words(chosen.source)}. {own_errors} the pooled errors of soft tissue. {_held(table)} The model applies "
         "to tissue that is strained and imaged like these phantoms; elsewhere no coverage is guaranteed."
     )
@@ -192,7 +192,8 @@ def error_bars(
 _WORDS = {
     r", seeds \[[^]]*\]": "",
     r"attached-(\w+)": r"\1 with tissue attached to bone",
-    r"too large by -1, \+0, \+1 voxels": "exact or one voxel too small or too large",
+    r", bones and skin in (label maps[\w ]*) too large by -1, \+0, \+1 voxels": r", with bones and skin in \1 drawn "
+    "exactly, or one voxel too small or too large",
     r"widened by (\d+) pairs that finite-element models move": r"widened by factors from \1 image pairs moved by "
     "finite-element models",
 }

@@ -22,7 +22,9 @@ from dvc import (
 )
 from dvc.atomic_files import write_json
 from dvc.errors import InputError
+from dvc.images.bone_names import is_bones_name
 from dvc.registration.register import refuse_one_image_twice
+from dvc.report.alike import listed
 from dvc.report.drawing import Drawing
 from dvc.report.labels import label_slices
 from dvc.report.page import Section, Table
@@ -113,9 +115,14 @@ def label(
     volumes = volumes_ml(made.labels)
     uncertain = f"{100 * made.uncertain:.0f} % of the voxels have an uncertain label (probability below 90 %)"
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
-    lines = (*changed, told, f"{uncertain}; {files.picture} shows where.", *made.notes, f"Label map: {files.labels}")
+    bones = [name for name in volumes if is_bones_name(name)]
+    only = f"Bones: {listed(bones) if bones else 'none'}; one that is not among them counts as fat"
+    lines = (
+        *changed, told, f"{uncertain}; {files.picture} shows where.", f"{only}.", *made.notes,
+        f"Label map: {files.labels}",
+    )  # fmt: skip
     table = Table("Volumes", ("tissue", "volume, mL"), tuple(volumes.items()))
-    section = Section(title, None, (table,), (picture,), (f"{uncertain}.", *made.notes), pictures_first=True)
+    section = Section(title, None, (table,), (picture,), (f"{uncertain}. {only}.", *made.notes), pictures_first=True)
     return Labelled(files.labels, lines, headline=f"{', '.join(volumes)}; {uncertain}", section=section)
 
 

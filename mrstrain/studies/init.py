@@ -166,8 +166,10 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
             f"{place / 'Load0'} and {place / 'Load1'}."
         )
     found.slices = few(_slices(place), most=1)
-    picture, names = _drawn(place, found)
+    picture, names = _drawn(place, found, found.bone_mask)
     answers = Answers() if ask is None else ask(found, names, picture)
+    if answers.bone_mask:
+        picture, _ = _drawn(place, found, answers.bone_mask)
     found.unused.pop(answers.bone_mask or "", None)
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # TOML has no surrogate pairs
@@ -185,8 +187,8 @@ def init(folder: Path | str, *, name: str = "Subject 01", ask: Ask | None = None
     return NewStudy(target, found, picture, auto)
 
 
-def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
-    """The picture of the images, or why there is none, and the names of the labels."""
+def _drawn(place: Path, found: StudyInputs, mask: str | None) -> tuple[Path | str, list[str]]:
+    """The picture of the images with labels or mask, or why there is none, and the names of the labels."""
     from dvc.report.drawing import png_bytes
     from mrstrain.studies.picture import Labelled, overview
 
@@ -200,9 +202,9 @@ def _drawn(place: Path, found: StudyInputs) -> tuple[Path | str, list[str]]:
         others = {load: read_image(place / image, allow_missing=True) for load, image in found.loads.items()}
         names = [] if labels is None else [name for number, name in labels.names.items() if number != 0]
         shown = Labelled.of(unloaded, labels)
-        if labels is None and found.bone_mask is not None:
+        if not shown.regions and mask is not None:
             with suppress(InputError):  # `check` tells what is wrong with it
-                shown = Labelled(unloaded, {BONE: read_mask(place / found.bone_mask, unloaded.grid).inside})
+                shown = Labelled(unloaded, {BONE: read_mask(place / mask, unloaded.grid).inside})
         with whole_file(place / PICTURE) as file:
             file.write_bytes(png_bytes(overview(shown, others)))
     except InputError as error:

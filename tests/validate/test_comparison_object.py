@@ -84,7 +84,7 @@ def test_what_is_read_back_is_what_was_written(comparison: Comparison, folder: P
         assert getattr(back, same) == getattr(comparison, same), same
     assert str(back) == str(comparison)
     assert str(back).startswith(
-        "Verdict on the inputs: Use with care\n"
+        "Measurement and model files: Use with care\n"
         "Load1: area between strain-volume curves (max. shear 0.05 to 0.5), mL, best first: "
     )
     assert "half is linear." in str(back)

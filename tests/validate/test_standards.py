@@ -55,8 +55,8 @@ def test_the_answer_comes_first_and_names_model_tissue_and_probability() -> None
     assert first == (
         "In fat, the largest tissue, the probability that the model represents the measurement is 100 % for right and "
         "0 % for no deformation; similar values mean that this metric does not distinguish them. 1 of the 1 "
-        "coefficients of right lie within their uncertainty. The probability is lower or higher than their share, "
-        "since each is weighted by the size of its error."
+        "coefficients of right lie within their uncertainty. The probability can differ from this share, "
+        "because coefficients are weighted by the size of their error."
     )
     assert "which CWA 16799 accepts (residual 0.000, measurement uncertainty 0.010, 0 clusters" in accepted
     assert guide.startswith(

@@ -140,7 +140,7 @@ def test_a_load_that_hardly_strains_does_not_judge_and_a_total_is_a_mean_of_shar
     high = {name: max_shear(gamma) for name, gamma in {"a": 0.5, "b": 0.3, "measured": 0.38}.items()}
     assert compared == (
         f"Load1: b predicts {high['b'] / high['measured']:.1f} times the measured strain (95th percentile in all soft "
-        f"tissue, as measured: {high['b']:.3f} against {high['measured']:.3f}), "
+        f"tissue: {high['b']:.3f} against {high['measured']:.3f} measured, bias included), "
         f"a {high['a'] / high['measured']:.1f} times ({high['a']:.3f})."
     )
     assert second.startswith("Best match under Load2")

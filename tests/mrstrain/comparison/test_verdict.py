@@ -16,7 +16,7 @@ from mrstrain.comparison.compare import Compared, compare
 from tests.mrstrain.comparison.test_compare import given, rows, with_errors
 from tests.validate.test_comparison import cube, sheared
 from validate import Misfit
-from validate.comparison import verdict_on
+from validate.verdict import verdict_on
 
 
 def judged(study: Path, **levels: str) -> None:
@@ -39,7 +39,7 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
     reason = "Load2, registration (Do not trust): The map of Load2 folds."
     assert reason in found.comparison.notes
     summary = found.summary()
-    assert summary[0] == "Verdict on the inputs: Do not trust"
+    assert summary[0] == "Measurement and model files: Do not trust"
     assert reason in summary
     over_all, first, second = found.comparison.ranking.statements
     assert over_all.endswith("It includes Load2, whose registration has the verdict Do not trust.")

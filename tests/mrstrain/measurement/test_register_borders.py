@@ -287,8 +287,7 @@ def test_the_images_may_lie_askew_and_be_stored_in_any_order(layers, found, work
     np.testing.assert_allclose(turn.T @ other_H @ turn, H, atol=1e-3)
 
 
-@pytest.mark.full_size
-@pytest.mark.parametrize("skin", [USUAL_SKIN, None])
+@pytest.mark.parametrize("skin", [USUAL_SKIN, pytest.param(None, marks=pytest.mark.full_size)])
 def test_threads_do_not_change_a_bit(layers, skin):
     """From images as they are: N4 and elastix, which come before, do not promise that."""
     fixed, moving, body, labels, bone = (layers[name] for name in ("reference", "loaded", "tissue", "labels", "bone"))

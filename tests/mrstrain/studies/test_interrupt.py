@@ -187,7 +187,7 @@ def running_a_cohort(images: Path, folder: Path) -> Case:
 @pytest.mark.parametrize(
     ("case", "group"),
     [
-        (simulating, False), slow(simulating, True), slow(meshing, False), slow(meshing, True),
+        (simulating, False), slow(simulating, True), slow(meshing, False), (meshing, True),
         slow(measuring_accuracy, False), slow(running_a_cohort, True),  # whose studies run as that of `run` above
     ],
 )  # fmt: skip

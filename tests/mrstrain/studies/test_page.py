@@ -24,7 +24,7 @@ from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import TABLE, write_errors
 from phantoms import TissueError
 from tests.mrstrain.comparison.test_methods import measured
-from validate.comparison import verdict_on
+from validate.verdict import verdict_on
 
 STUDY = """
 [study]

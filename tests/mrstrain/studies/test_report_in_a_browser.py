@@ -64,10 +64,10 @@ def test_tables_of_many_columns_fit_a_laptop_and_a_sheet_of_paper(tab, report):
         > 10
     )
     assert tab.value("[...document.querySelectorAll('.wide')].filter((one) => one.scrollWidth > one.clientWidth)") == []
-    tab.call("Emulation.setEmulatedMedia", media="print")
-    opened(tab, report, 688)  # of A4, between its margins
-    tab.value(UNFOLD)
     try:
+        tab.call("Emulation.setEmulatedMedia", media="print")
+        opened(tab, report, 688)  # of A4, between its margins
+        tab.value(UNFOLD)
         assert tab.value(TOO_WIDE) <= 0
     finally:
         tab.call("Emulation.setEmulatedMedia", media="")
