@@ -239,7 +239,7 @@ class Section:
     paragraphs: tuple[str, ...] = ()
     viewers: tuple[Viewer, ...] = ()
     folded: bool = False
-    pictures_first: bool = False  # before the tables, and all but the first two paragraphs (one below a banner)
+    pictures_first: bool = False  # before the tables, and all but the first two paragraphs (below a banner, all)
     summary: Table | None = None  # its first table, which a report of many sections also begins with
     caveat: str = ""  # a sentence in the note of that table, which stands below that beginning, too
 

@@ -186,9 +186,8 @@ def test_slope_and_r2_of_the_best_match_are_told_at_once(comparison: Comparison,
     first = summary.index(comparison.ranking.statements[0])
     assert summary[first + 1].startswith(told)
     assert "Slope and R² are 1 if the fields are equal; R² is near 0" in summary[first + 1]
-    before, picture = page.index(told), page.index("<figure")
-    assert before < picture
-    assert page.index(comparison.ranking.statements[0]) < before
+    banner, regression = page.index(comparison.ranking.statements[0]), page.index(told)
+    assert banner < page.index("<figure") < regression < page.index("<table")
     table = re.search(r"<thead>.*?</tfoot>", page, re.DOTALL)
     assert table is not None
     assert re.search(r">slope</th><th[^>]*>R²</th></tr></thead>", table[0])
