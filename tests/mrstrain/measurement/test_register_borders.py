@@ -97,8 +97,7 @@ def shear_of(folder: Path) -> np.ndarray:
     return read_image(folder / "max_shear.nii.gz", allow_missing=True).values
 
 
-ONE_SPLINE = {"skin": 0.126, "fat": 0.108}
-"""The error of the load registered with one spline, in skin, and in fat within 3 mm of bone."""
+ONE_SPLINE = {"skin": 0.126, "fat": 0.108}  # the error of the load registered so, the latter within 3 mm of bone
 
 
 @pytest.mark.full_size
