@@ -23,7 +23,8 @@ def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: Fl
 
     Their cores are parts, 0.1 mL or more, that lie 2.5 mm or more from what is dark. From the cores regions grow until
     they meet in the darkest places. The largest is the soft tissue; others are bones if the border where they meet
-    their neighbours is dark, and soft tissue if it is not. The bones then get the rest of their rim.
+    their neighbours is dark, and soft tissue if it is not. Where voxels are as wide as a rim, it has gaps; what a
+    brighter limit of what is dark gives there is added. The bones then get the rest of their rim.
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def _fitted(values: FloatArray, weights: FloatArray, voxel_mm: float, whole: "_F
     """Fit profiles (n, depths) above the air: mean over the thicknesses tried, by how likely they are."""
     known = (weights > 0.0).sum(axis=1) >= _LEAST_DEPTHS
     y, w = values[known], weights[known]
-    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(y), _AT_ONCE)]
+    parts = [slice(first, first + _AT_ONCE) for first in range(0, max(1, len(y)), _AT_ONCE)]
     found = [_best_levels(y[part], w[part], voxel_mm, whole) for part in parts]
     cost, shift, *levels = (np.concatenate(each) for each in zip(*found, strict=True))
     # Where no profile fits, such as over bone close to skin, the thickness is that of the whole body.
