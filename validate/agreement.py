@@ -127,11 +127,8 @@ def regression_told(rows: Sequence[Agreement], model: str) -> str:
         told += [f"{name} {', '.join(values)}"] if values else []
     why = " (best by area)" * (len({row.model for row in rows}) > 1)
     means = "Slope and R² are 1 if the fields are equal; R² is near 0 if the strain is in other places than measured."
-    return (
-        f"Cell-by-cell regression of {model}{why} on the measurement, slope (R²): {'; '.join(told)}. {means}"
-        if told
-        else ""
-    )
+    regression = f"Cell-by-cell regression of {model}{why} on the measurement"
+    return f"{regression}, slope (R²): {'; '.join(told)}. {means}" if told else ""
 
 
 @dataclass(frozen=True, slots=True)

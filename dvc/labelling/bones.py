@@ -5,6 +5,8 @@ from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_fi
 from skimage.segmentation import watershed
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from dvc.images.image import box_of
+from dvc.images.tissue import within
 
 _BLUR_MM = 0.5
 _CORE_MM = 2.5  # from what is dark, and more than a slice: narrower gaps in a rim do not join bone and soft tissue
@@ -15,7 +17,7 @@ _LEAST_ML = 0.1  # of a core
 _LIMITS, _DARK_SHARE = (1.0, 1.2, 1.3), 0.6
 _MORE = 1.1  # times what is known of a bone, for it to get what a brighter limit finds there
 _RIM_MM = 1.5  # thickness of a dark rim beyond its darkest part, at most
-_DARK_RIM = 0.6  # brightness of a rim over that of its darker side; .37 to .59 for bones, .66 or more for soft tissue
+_DARK_RIM = 0.6  # brightness of a rim over that of its darker side: nearly all bones below, soft tissue from .62 on
 
 
 def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: FloatArray) -> IntArray:
@@ -37,7 +39,14 @@ def bones_in(values: Float32Array, where: BoolArray, dark: float, spacing_mm: Fl
     spacing_mm : (3,)
         Voxel size.
     """
-    blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
+    bones, box = np.zeros(where.shape, dtype=np.int64), box_of(where, (1, 1, 1))
+    if where.any():
+        bones[box] = _bones(gaussian_filter(values, _BLUR_MM / spacing_mm)[box], where[box], dark, spacing_mm)
+    return bones
+
+
+def _bones(blurred: Float32Array, where: BoolArray, dark: float, spacing_mm: FloatArray) -> IntArray:
+    """`bones_in` of what is blurred already, in a box around what is looked at."""
     found = np.zeros(where.shape, dtype=np.int64)
     for limit in _LIMITS:
         _add(found, _inner_bones(blurred, where, limit * dark, dark, spacing_mm))
@@ -67,7 +76,7 @@ def _inner_bones(
 ) -> IntArray:
     """Bones up to the darkest places of their rims, numbered from 1; 0 elsewhere."""
     lit = where & (blurred > limit)
-    parts, count = label(distance_transform_edt(lit, sampling=spacing_mm) > max(_CORE_MM, float(spacing_mm.max())))
+    parts, count = label(lit & ~within(~lit, spacing_mm, max(_CORE_MM, float(spacing_mm.max()))))
     sizes_ml = np.bincount(parts.ravel(), minlength=count + 1) * float(np.prod(spacing_mm)) / 1000.0
     sizes_ml[0] = 0.0
     large = np.flatnonzero(sizes_ml >= _LEAST_ML)
@@ -88,7 +97,8 @@ def _rims(regions: IntArray, values: Float32Array, dark: float) -> tuple[FloatAr
     By the number of the region; infinite and 0 for one that meets no other.
     """
     count = int(regions.max()) + 1
-    usual = np.concatenate([[np.inf], median(values, regions, np.arange(1, count))])
+    inside = regions > 0
+    usual = np.concatenate([[np.inf], median(values[inside], regions[inside], np.arange(1, count))])
     total, faces, dim = np.zeros((3, count))
     for axis in range(regions.ndim):
         one, other = np.moveaxis(regions, axis, 0)[1:], np.moveaxis(regions, axis, 0)[:-1]

@@ -187,7 +187,10 @@ def _fitted(values: FloatArray, weights: FloatArray, voxel_mm: float, whole: "_F
 def _best_levels(
     y: FloatArray, w: FloatArray, voxel_mm: float, whole: "_Fit | None"
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of profiles with their weights, for each thickness: cost, shift of the surface, level of skin and below it."""
+    """The best shift of the surface for each profile (n, depths) and each thickness that is tried, (n, thicknesses).
+
+    Cost (sum of squares, of brightness), shift (mm), and the brightness of skin and of what is below it.
+    """
     wy, cost = w * y, np.full((len(y), len(_THICK_MM)), np.inf)
     shift, level_of_skin, level_below = (np.zeros(cost.shape) for _ in range(3))
     usual, hold = (np.zeros(2), 1e-6) if whole is None else (whole.levels[0], _LEVEL_WEIGHT)

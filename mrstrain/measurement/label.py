@@ -116,13 +116,15 @@ def label(
     uncertain = f"{100 * made.uncertain:.0f} % of the voxels have an uncertain label (probability below 90 %)"
     told = f"Volumes, mL: {', '.join(f'{name} {volume:.1f}' for name, volume in volumes.items())}"
     bones = [name for name in volumes if is_bones_name(name)]
-    only = f"Bones: {listed(bones) if bones else 'none'}; one that is not among them counts as fat"
+    found_bones = f"Bones found: {listed(bones) if bones else 'none'}. A bone that was missed is labelled as fat."
     lines = (
-        *changed, told, f"{uncertain}; {files.picture} shows where.", f"{only}.", *made.notes,
+        *changed, told, f"{uncertain}; {files.picture} shows where.", found_bones, *made.notes,
         f"Label map: {files.labels}",
     )  # fmt: skip
     table = Table("Volumes", ("tissue", "volume, mL"), tuple(volumes.items()))
-    section = Section(title, None, (table,), (picture,), (f"{uncertain}. {only}.", *made.notes), pictures_first=True)
+    section = Section(
+        title, None, (table,), (picture,), (f"{uncertain}. {found_bones}", *made.notes), pictures_first=True
+    )
     return Labelled(files.labels, lines, headline=f"{', '.join(volumes)}; {uncertain}", section=section)
 
 

@@ -67,6 +67,7 @@ def test_everything_is_written_and_agrees(folder: Path) -> None:
     assert record["inputs"]["bone"][0]["sha256"]
     assert 0.0 < record["uncertain"] < 0.5
     told = (folder / "told.txt").read_text()
+    assert "Bones found: bone and other bone. A bone that was missed is labelled as fat." in told
     assert f"{100 * record['uncertain']:.0f} % of the voxels have an uncertain label" in told
     assert told.endswith(f"Label map: {made / 'tissues.nii.gz'}")
 
