@@ -138,17 +138,13 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     columns = ("model", "quantity", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E, lower", "upper")
     table = Table(
         "Comparison error and validation uncertainty (ASME V&V 20)", columns,
-        tuple((one.model, one.statistic, *(_cell(v) for v in astuple(one)[4:])) for one in shown),
+        tuple((one.model, one.statistic, *astuple(one)[4:]) for one in shown),
         "S: simulated; D: measured, with the bias of the measurement removed. Standard uncertainties from the mesh "
         "(u_num), the other inputs of the model (u_input) and the measurement (u_D); u_val is the root sum of squares "
         "of the known ones. Interval: E ± 2 u_val, for the area its 95 % interval. A dash: not given. Strains have no "
         "unit, volumes and areas are in mL. Single tissues are in comparison_error.csv.",
     )  # fmt: skip
     return [Section(f"{load}, validation uncertainty", None, (table,), paragraphs=tuple(words), folded=True)]
-
-
-def _cell(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:.3g}"
 
 
 def _parts(by_input: Mapping[str, float], u_d: float) -> tuple[float, float, float, float]:
