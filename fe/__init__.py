@@ -1,7 +1,7 @@
 """Finite-element models of soft tissue under load.
 
 Conforming tetrahedral meshes from a label map, constitutive models, published material sets, fits of a model to a
-stretch-stress curve, a solver for nearly incompressible tissue under a rigid plate, and input files for other solvers.
+stress-stretch curve, a solver for nearly incompressible tissue under a rigid plate, and input files for other solvers.
 Imports from `dvc` only.
 
     import fe

@@ -67,11 +67,11 @@ def stress_stretch(curves: "Sequence[Curve]", fitted: "Fit") -> Figure:
 
 
 def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
-    """Maximum shear strain in a slice through the lowest point of the bone, along the plate's normal and the shear.
+    """Maximum shear strain in a slice along the plate's normal and the shear.
 
-    If loads have their own directions, those of the first load are used. Cells are cut in the unloaded configuration
-    and drawn in their deformed position; the dashed line is the plate. The colour scale ends at the 99th percentile
-    (by volume) over all loads.
+    The slice goes through the point of the bone nearest to the plate. If loads have their own directions, those of the
+    first load are used. Cells are cut in the unloaded configuration and drawn in their deformed position; the dashed
+    line is the plate. The colour scale ends at the 99th percentile (by volume) over all loads.
     """
     axes = states[0].plate_axes
     assert axes is not None
@@ -244,7 +244,7 @@ def forces(states: Sequence[LoadState]) -> Columns:
 
 
 def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
-    """The mesh in a slice through the lowest point of the bone, coloured by tissue."""
+    """The mesh in a slice through the point of the bone nearest to the plate, coloured by tissue."""
     point, axes = _lowest_bone_point(mesh, plate.axes), _on_page(plate.axes)
     cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), axes, point)
     figure, (panel,), room = _slice_panels(["Unloaded"], corners, axes)

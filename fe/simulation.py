@@ -202,11 +202,11 @@ class Simulation:
                 f"{self.name}, {state.load.name}:{part} plate displacement {moved:z.2f} mm normal, {along:z.2f} mm "
                 f"shear; max. shear, median / 90th percentile: {shear}"
             )
-        return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
+        return "\n".join([*lines, *(n if n.startswith(f"{self.name} ") else f"{self.name}: {n}" for n in self.notes)])
 
     @checked
     def plot(self, loads: Sequence[str] | None = None) -> "Figure":
-        """Maximum shear strain in a slice through the lowest point of the bone, one panel per load; all by default."""
+        """Maximum shear strain where the bone is nearest to the plate, one panel per load; all by default."""
         from fe.figures import sagittal_slice
 
         return sagittal_slice(self.mesh, self.states if loads is None else [self.state(name) for name in loads])

@@ -81,11 +81,12 @@ def _beside(of_best: Sequence[ComparisonError]) -> str:
         "the inputs (u_input)": any(np.isnan(error.u_input) for error in of_best),
     }
     lacking = [name for name, lacks in by.items() if lacks]
-    also = f", though the uncertainty of {listed(lacking)} is not given and may explain it" if lacking else ""
+    why = "is not given and may explain the difference"
+    also = f". The uncertainty of {listed(lacking)} {why}" if lacking else ""
     return (
         "High strains (95th percentile of the maximum shear strain in all soft tissue, in the compared cells), "
-        f"{of_best[0].model} against measured with its bias removed: {told}. Too high or too low: the difference "
-        f"exceeds twice the known standard uncertainty (2 u_val){also}."
+        f"{of_best[0].model} against the measurement, whose bias is removed: {told}. Too high or too low: the "
+        f"difference exceeds twice the known standard uncertainty (2 u_val){also}."
     )
 
 

@@ -126,13 +126,14 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     }
     cause = "The model form is the likely cause: the uncertainties of mesh, inputs and measurement do not explain it."
     if any(lacking.values()):
-        cause = "The measurement uncertainty does not explain it; the uncertainties that are not given below may do so."
+        cause = "The measurement uncertainty does not explain this; the uncertainties not given (next lines) may."
     words = [
         "In all soft tissue, the comparison error exceeds the expanded validation uncertainty (2 u_val) in "
         f"{beyond} of {len(strains)} quantities of all models (areas not counted). {cause}"
     ]
     known_as = {"u_num": "Uncertainty of the mesh (u_num)", "u_input": "Uncertainty of the inputs (u_input)"}
     words += [f"{known_as[u]} not given: {', '.join(dict.fromkeys(of))}." for u, of in lacking.items() if of]
+    words += ["To have them computed, give [uncertainty] in the study file."] * any(lacking.values())
     if unknown := dict.fromkeys(one.statistic for one in statistics if np.isnan(one.error)):
         words.append(f"D and E are not defined beyond the range of the measured curves: {', '.join(unknown)}.")
     columns = ("model", "quantity", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E, lower", "upper")
@@ -141,8 +142,9 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
         tuple((one.model, one.statistic, *astuple(one)[4:]) for one in shown),
         "S: simulated; D: measured, with the bias of the measurement removed. Standard uncertainties from the mesh "
         "(u_num), the other inputs of the model (u_input) and the measurement (u_D); u_val is the root sum of squares "
-        "of the known ones. Interval: E ± 2 u_val, for the area its 95 % interval. A dash: not given. Strains have no "
-        "unit, volumes and areas are in mL. Single tissues are in comparison_error.csv.",
+        "of the known ones. Interval: E ± 2 u_val, for the area its 95 % interval. A dash: not given; the area, itself "
+        "a difference, has no S and D. p95: 95th percentile. Strains have no unit, volumes and areas are in mL. Single "
+        "tissues are in comparison_error.csv.",
     )  # fmt: skip
     return [Section(f"{load}, validation uncertainty", None, (table,), paragraphs=tuple(words), folded=True)]
 

@@ -103,7 +103,7 @@ def slices(
 ) -> Figure:
     """Maximum shear strain in a slice, measured and simulated, on the deformed tissue.
 
-    The slice contains the plate's normal and the direction of shear. All panels show the same cells; grey is undefined.
+    The slice contains the plate's normal and the direction of shear. All panels show the same cells. Grey: no result.
     Nodes outside the measurement are drawn with the displacement of the nearest node inside. Letters name the sides of
     the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """

@@ -159,8 +159,8 @@ def _by_percentile(one: LoadComparison) -> str:
     if not models or not measured > 0.0:
         return ""
     first, *others = (f"{_times(high[name] / measured)} times" for name in models)
-    shown = f"95th percentile in all soft tissue: {high[models[0]]:.3f} against {measured:.3f} measured, bias included"
-    told = [f"{one.load}: {models[0]} predicts {first} the measured strain ({shown})"]
+    shown = f"95th percentile in all soft tissue: {high[models[0]]:.3f} against {measured:.3f} as measured"
+    told = [f"{one.load} (area metric not informative): {models[0]} predicts {first} the measured strain ({shown})"]
     told += [f"{name} {times} ({high[name]:.3f})" for name, times in zip(models[1:], others, strict=True)]
     worse = [name for name in models if high[name] >= 2.0 * measured]
     no_better = "no better than a model without deformation"

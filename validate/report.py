@@ -36,15 +36,16 @@ _DIFFERENCES = (  # stem of the files, quantity, its name with its unit in the c
 )
 _COEFFICIENTS = "coefficients"  # stem of the files
 _AGREED = (
-    "measured mean", "model mean", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits, lower", "upper",
+    "measured mean", "model mean", "slope", "intercept", "R²", "RMSE", "concordance", "mean difference",
+    "limits, lower", "upper",
 )  # fmt: skip
 _CLOSING = Section(
     "How to read this",
     paragraphs=(
         "All fields are compared at the centroids of the same cells of one mesh, weighted by cell volume, in the "
-        "reference (unloaded) configuration. A cell in which the measurement or any model is undefined is left out "
-        "for all. Strain is Green-Lagrange; the maximum shear strain is (E1 - E3)/2. Displacement is relative to the "
-        "bone, LPS mm.",
+        "reference configuration (that of the unloaded image). A cell in which the measurement or any model is "
+        "undefined is left out for all. Strain is Green-Lagrange; the maximum shear strain is (E1 - E3)/2. "
+        "Displacement is relative to the bone, LPS mm.",
         "The area between two strain-volume curves (the area validation metric, with volume in place of probability) "
         "is the integral of the absolute difference between the two volumes over the range of strain, in mL. The "
         "normalised area is divided by the volume of the tissue and the width of the range. Curves contain no "
@@ -120,7 +121,7 @@ def draw(one: LoadComparison, models: Sequence[str], image: Path | None, largest
 
 def _place(one: LoadComparison) -> str:
     """Where slices go through, in words."""
-    return f"the lowest point of {one.bones[0]}" if one.bones else "the middle of the mesh"
+    return f"the point of the {one.bones[0]} nearest to the plate" if one.bones else "the middle of the mesh"
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
@@ -158,9 +159,9 @@ def _viewer(
         shown = np.nan_to_num(voxels[box]) if seen.same_as(labels.grid) else shown
     return Viewer(
         "Interactive 3-D viewer",
-        f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and simulated by {model.name}. "
-        "Behind it: the registered image of the first load. Drag to move through the slices; drag with the right "
-        "button to rotate. Both views move together. The viewer needs WebGL 2.",
+        f"Maximum shear strain, 0 to {most:g}, in the reference configuration: measured, and simulated by {model.name} "
+        "(smallest area under this load). Behind it: the registered image of the first load. Drag to move through the "
+        "slices; drag with the right button to rotate. Both views move together. The viewer needs WebGL 2.",
         Volume.image("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
         (Volume.overlay("measured", grid, shear[0], most), Volume.overlay(model.name, grid, shear[1], most)),
     )

@@ -35,7 +35,7 @@ def strip_of(one: LoadComparison, measured: Deformation, results: Sequence[FeRes
     masks = labels.labels > 0, np.isin(labels.labels, bones)
     return Strip(
         one.load, plane, view.extent_mm(plane), view.title(plane),
-        "the lowest point of the bone" if one.bones else "the middle of the mesh",
+        "the point of the bone nearest to the plate" if one.bones else "the middle of the mesh",
         levelled(view.cut(shown, plane), window_of(view, shown)),
         tuple(view.cut(mask, plane) for mask in masks), pages,
     )  # fmt: skip

@@ -252,10 +252,11 @@ def _held(table: ErrorTable) -> str:
         return "The coverage of these intervals is not known: the error model rests on a single registration."
     factors = {f"{factor:.1f}" for factor in (table.widening_of or {"": table.factor}).values()}
     times = " to ".join(dict.fromkeys((min(factors, key=float), max(factors, key=float))))
-    share, where = "95 %", "the parts of the study left out"
+    share, where, whole = "95 %", "the parts of the study left out", ""
     if table.widening_of:
-        share, where = "97 % (95 % and a margin for other motions)", "image pairs moved by finite-element solutions"
-    return f"Intervals are widened by a factor of {times}, to contain {share} of the true values in {where}."
+        share, where = "97 % (95 % and a margin for other motions)", "image pairs moved by finite-element models"
+        whole = f" (all soft tissue: {table.factor:.1f})"
+    return f"Intervals are widened by a factor of {times}{whole}, to contain {share} of the true values in {where}."
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:

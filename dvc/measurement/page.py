@@ -87,7 +87,7 @@ def strain_drawing(
     largest = figures.shear_scale(max_shear) if shared is None else shared
     through = "Slices through the middle of the tissue."
     if subject.bone is not None:
-        through = "Slices through the point of the bone that is nearest to the plate."
+        through = "Slices through the point of the bone nearest to the plate."
     among = "" if shared is None else "report"
     shown, note = (max_shear, largest, labels), f"{through} {figures.scale_told(largest, among=among)}"
     drawing = Drawing.of(STRAIN, figures.strain_slices, view, subject.reference, *shown, note=note)
@@ -174,9 +174,12 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
 
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     above = (f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
-    columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99", *above)
-    note = "Maximum shear strain (E₁ − E₃)/2 (Green-Lagrange), and the volume in which it exceeds a value."
-    return Table("Maximum shear strain by region", columns, rows, note)
+    columns = ("tissue", "volume, mL", "defined, %", "median", "p90", "p95", "p99", *above)
+    note = (
+        "Maximum shear strain (E₁ − E₃)/2 (Green-Lagrange), and the volume in which it exceeds a value. p90: 90th "
+        "percentile."
+    )
+    return Table("Percentiles and volumes of the maximum shear strain", columns, rows, note)
 
 
 def estimates(row: RegionRow, intervals: Sequence[Interval]) -> tuple[Estimate, Estimate]:

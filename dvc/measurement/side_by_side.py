@@ -24,7 +24,8 @@ FIGURE = "slices_by_load"
 def measured_by_load(subject: Subject, folders: Mapping[str, Path]) -> Drawing:
     """The unloaded image, and the measured strain of each load in one slice, from folders of results by load.
 
-    The slice goes through the lowest point of the bone, or the middle of the body, and has the plate's normal in it.
+    The slice goes through the point of the bone nearest to the plate, or the middle of the body, and has the plate's
+    normal in it.
 
     Raises
     ------
@@ -32,7 +33,7 @@ def measured_by_load(subject: Subject, folders: Mapping[str, Path]) -> Drawing:
         If the maximum shear strain of a load is missing, damaged, or not on the voxels of the unloaded image.
     """
     reference, body, point = subject.reference, subject.body(), subject.lowest_bone_point_mm
-    where = "the lowest point of the bone"
+    where = "the point of the bone nearest to the plate"
     if point is None:
         points, where = body.points(), "the middle of the tissue"
         point = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]

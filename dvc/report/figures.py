@@ -161,9 +161,9 @@ def scale_told(end: float, *, among: str = "") -> str:
     first, of = "The scale", ""
     if among:
         first = f"All maps of the maximum shear strain in this {among} have one colour scale. It"
-        of = "under the load with the largest strain, "
-    rule = f"the 99th percentile of the measured strain, {of}rounded up to a multiple of 0.05"
-    return f"{first} ends at {end:g}: {rule}, but at least 0.05 and at most 0.5. Larger values have the last colour."
+        of = " under the load with the largest strain"
+    rule = f"99th percentile of the measured strain{of}, rounded up; at most 0.5"
+    return f"{first} ends at {end:g} ({rule}). Larger values have the last colour."
 
 
 def round_up(value: float) -> float:

@@ -262,7 +262,7 @@ def _alike(column: Sequence[Cell]) -> list[str]:
     for place, (cell, text) in enumerate(zip(column, texts, strict=True)):
         if isinstance(cell, float | np.floating) and np.isfinite(cell) and (value := float(text)):
             whole = int(np.floor(np.log10(abs(value)))) + 1  # digits before the point; below 0.1, zeros after it
-            texts[place] = text if abs(value) < 1e-4 else f"{value:.{max(0, min(decimals, 3 - whole))}f}"
+            texts[place] = text if abs(value) <= 1e-4 else f"{value:.{max(0, min(decimals, 3 - whole))}f}"
     return texts
 
 

@@ -43,8 +43,8 @@ def strain_by_load(strips: Sequence[Strip], rows: Sequence[str], largest: float)
     """Maximum shear strain under each load, in one slice of the unloaded anatomy.
 
     Load0 is the unloaded image, or its label map if there is no image. A anterior, P posterior, S superior, I
-    inferior, R right, L left. White lines are the surfaces of the body and of the bones. Grey: strain is not defined
-    (not measured, or outside the mesh of a model).
+    inferior, R right, L left. White lines are the surfaces of the body and of the bones. Grey: no result (not
+    measured, or outside the mesh of a model).
     """
     # A row for each name; they are those of `Strip.max_shear`. The colours end at ``largest``.
     first, many = strips[0], len(rows) > 1

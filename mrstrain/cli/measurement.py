@@ -155,7 +155,7 @@ def accuracy(
             help="Motion of the phantom's tissue: still (none, to measure the noise floor), smooth, sliding (of the "
             "fat pad), swelling (the volume changes), Load1 to Load4, attached-Load1, attached-Load3 (tissue attached "
             "to bone), or wave-L (shear wave, wavelength L in mm; not with gauss-newton-bone and -borders). Default: "
-            "all of these, with eight waves, but not swelling. Repeat for several."
+            "all but swelling, and eight waves with the other presets. Repeat for several."
         ),
     ] = None,
     seed: Annotated[

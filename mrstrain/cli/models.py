@@ -176,5 +176,5 @@ def fit(
     nu: Annotated[float, typer.Option(help="Poisson's ratio for simulations.")] = 0.4999,
     tissue: Annotated[str, typer.Option(help="Tissue to which the written material set assigns the model.")] = "fat",
 ) -> None:
-    """Fit a constitutive model to a stretch-stress curve, with 95 % intervals and the range of stability."""
+    """Fit a constitutive model to a stress-stretch curve, with 95 % intervals and the range of stability."""
     tell(mrstrain.fit(curve, law, out=out, test=test, nu=nu, tissue=tissue))

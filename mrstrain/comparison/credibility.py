@@ -147,10 +147,10 @@ def _evidence(held: Holdings) -> Table:
 def _validation(held: Holdings) -> str:
     """The comparison with the measured strain: verdicts, statements, and the area of each model with its interval."""
     verdicts = "; ".join(f"{load} {verdict.words}" for load, verdict in held.verdicts.items() if verdict is not None)
-    of = f"Verdicts on the measurement: {verdicts or NOT_GIVEN}"
+    of = f"Verdicts on the registrations: {verdicts or NOT_GIVEN}"
     if held.comparison is None:
         return f"{of}. Comparison with models: {NOT_GIVEN}"
-    return _sentences(of, *held.comparison.ranking.statements, _areas(held, held.comparison))
+    return _sentences(of, *held.comparison.ranking.statements[:1], _areas(held, held.comparison))
 
 
 def _areas(held: Holdings, comparison: Comparison) -> str:

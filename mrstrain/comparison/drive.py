@@ -82,7 +82,7 @@ def drive(
     inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
     record = provenance("drive", inputs, coordinates.plain())
     doubtful = [(m.load, m.verdict) for m in measurements if m.verdict and m.verdict.reasons]
-    lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
+    lines = [f"{load}: verdict on the registration: {verdict.words}" for load, verdict in doubtful]
     complete, regions = True, {str(n): region for n, region in enumerate(read.regions, start=1)}
     with ExitStack() as held_folders:
         for folder in folders.values():  # a study drives its sets side by side

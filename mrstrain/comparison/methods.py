@@ -100,9 +100,9 @@ def _measured(measured: Mapping[str, Path]) -> str:
         groups.setdefault(_registration(record) + _files(record), []).append(load)
     sentences = " ".join(f"{listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
-        sentences + " Displacement is given in the unloaded (reference) configuration. Strain is the Green-Lagrange "
-        "strain E = (F^T F - I)/2, and the maximum shear strain is half the difference between its largest and "
-        "smallest principal values."
+        sentences + " Displacement is given in the reference configuration (that of the unloaded image). Strain is the "
+        "Green-Lagrange strain E = (F^T F - I)/2, and the maximum shear strain is half the difference between its "
+        "largest and smallest principal values."
     )
 
 
@@ -230,7 +230,7 @@ def _compared(cells: int, criteria: Criteria) -> str:
     (low, high), version = criteria.strains, versions()["mrstrain"]
     return (
         f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
-        "tetrahedra, weighted by volume, in the unloaded configuration. The amount of strain was compared by the area "
+        "tetrahedra, weighted by volume, in the reference configuration. The amount of strain was compared by the area "
         f"between the strain-volume curves, for maximum shear strains from {low:g} to {high:g}. Location was compared "
         f"for tissue above {levels}, in clusters of at least {criteria.least_ml:g} mL, by overlap (Dice 1945), "
         "distance of the centroids, and 95th percentile of the Hausdorff distance. Agreement cell by cell was assessed "

@@ -31,11 +31,11 @@ _PARAMETERS = {
     "flip_angle_deg": "Flip angle, degrees", "acquisition_matrix": "Matrix of the acquisition",
 }  # fmt: skip
 _NOTE = (
-    "Source header: DICOM, or the JSON file of dcm2niix beside a NIfTI file. Its texts are shown only if they are "
+    'Source "header": DICOM, or the JSON file of dcm2niix beside a NIfTI file. Its texts are shown only if they are '
     "known names of scanners and sequences, so that no patient is named. A study file can give the rest, under "
     "[acquisition]. SNR: 75th percentile of the signal in tissue, divided by the standard deviation of the noise. "
-    "Standard uncertainty: standard deviation of the error about its bias. The spatial resolution was measured on "
-    "phantoms only."
+    "Standard uncertainty: standard deviation of the error about its bias. The spatial resolution is not measured on "
+    "these images; that on phantoms is in the documentation (Limitations)."
 )
 _WEIGHTS = {"bending": "1/mm", "volume": "1/mm³", "rigidity": "1/mm³", "volume_gradient": "1/mm"}
 _SPLINE_ALONE = "none but the control point spacing"

@@ -15,7 +15,7 @@ from dvc.report.page import LOPSIDED, Cell, Estimate, Section, Table
 from dvc.trust.error_model import POOLED
 from dvc.trust.quality import NoiseFloor, read_noise_floor
 
-_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the unloaded configuration{}."
+_NOTE = "Green-Lagrange, (E₁ − E₃)/2, in the reference configuration{}."
 _TITLE = "Measured maximum shear strain"
 _NEARLY = 0.9
 _INTERVALS = ", with the interval of 95 % coverage in brackets"
@@ -79,7 +79,7 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
         told += f" The 95th percentile may be as large in {listed(overlapping)}, since the intervals overlap."
     if beside.floor is not None:
         noise = f"{beside.floor.max_shear_p50:.3f} (median) and {beside.floor.max_shear_p95:.3f} (95th percentile)"
-        told += f" The noise floor is {noise}."
+        told += f" The noise floor, in all tissue but the bone, is {noise}."
     return told
 
 

@@ -1,4 +1,4 @@
-"""`fit`: a constitutive model fitted to a stretch-stress curve, with intervals, a figure and a material set."""
+"""`fit`: a constitutive model fitted to a stress-stretch curve, with intervals, a figure and a material set."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path

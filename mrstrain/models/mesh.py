@@ -55,8 +55,8 @@ class Meshed:
         if q.least_angle_deg < _CARE_ANGLE_DEG:
             lines.append(f"WARNING: the smallest dihedral angle is {q.least_angle_deg:.1f} degrees.")
         lines += [
-            f"{100 * share:.0f} % of the cells of {name} extend through its whole thickness; give a shorter edge "
-            "length there (--finer)."
+            f"{100 * share:.0f} % of the cells of {name} extend through its whole thickness. Give a shorter edge "
+            "length there: --finer, or finer under [mesh] in a study file."
             for name, share in q.thin
         ]
         lines += [

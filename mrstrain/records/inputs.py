@@ -107,6 +107,13 @@ def made_from_image(labels: Path) -> LabelsFromImage | None:
         return None
 
 
+def made_beside(labels: Path) -> tuple[Path, ...]:
+    """Files that lie beside a label map that `label` made, and belong to it: its record and its probabilities."""
+    stem = image_stem(labels.name)
+    endings = ".json", "_probability.json", f"_probability{labels.name.removeprefix(stem)}"
+    return tuple(path for ending in endings if (path := labels.with_name(stem + ending)).is_file())
+
+
 def read_matrix(path: Path) -> FloatArray:
     """Read a 4 x 4 matrix from a text file of four rows; InputError for any other file."""
     try:

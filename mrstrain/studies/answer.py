@@ -17,18 +17,16 @@ from validate.ranking import CLOSER
 
 _AREAS = "Areas of all models and loads"
 _PREDICTED = (
-    " {model} against measured: 95th percentiles in the compared cells, which may be part of a tissue; the bias "
-    "of the measurement is removed. Too high, too low: the difference exceeds twice the known standard uncertainty "
-    "(2 u_val). A dash in this column: not compared, or no uncertainty is known."
+    " {model} against measured: 95th percentiles in the compared cells, which may be part of a tissue, with the bias "
+    "of the measurement removed. Too high, too low: the difference exceeds twice the known standard uncertainty (2 "
+    "u_val). Dash: not compared, or no uncertainty is known."
 )
 _NEAREST = (
     " Best match: the model with the smallest area between its strain-volume curve and the measured one ({range}) in "
-    "that tissue alone. In all soft tissue (sentences above), over- and underestimates of different tissues cancel, "
-    "so another model may be best. In brackets: other models that may be as good, since their 95 % intervals overlap "
-    "with that of the best match, or are not known; no significance test is made for a single tissue. All of them have "
-    "an area at least 5 % smaller than no deformation; none: no model has. A dash in this column: hardly any of "
-    "the tissue is strained (less than 1 % above {low:g}), so its areas are not informative. If that holds for a whole "
-    "load, a sentence above tells how many times the measured strain each model predicts."
+    "that tissue. In all soft tissue, over- and underestimates of single tissues cancel, so another model may be best. "
+    "In brackets: models that may be as good, since their 95 % intervals overlap with that of the best match or are "
+    "not known; this is no significance test. None: no model has an area at least 5 % smaller than no deformation. "
+    "Dash: less than 1 % of the tissue exceeds {low:g}, so its areas are not informative."
 )
 
 

@@ -138,7 +138,7 @@ def costs(
     disk = sum(disk_bytes(stage, study, voxels) for stage in left) / _GIB
     free = shutil.disk_usage(study.place).free / _GIB
     lines = [
-        f"To do: {len(left)} of {len(stages)} stages, about {time} on {workers} cores, "
+        f"To do: {len(left)} of {len(stages)} stages, about {time} on {workers} cores if they are idle, "
         f"{needed:.1f} GiB of memory, {disk:.1f} GiB of disk space ({free:.0f} GiB free)."
     ]
     if further := [stage for stage in left if stage.kind == "vary" or stage.name == COARSE]:
@@ -151,8 +151,8 @@ def costs(
     if cells > _MANY_CELLS and any(stage.name == "mesh" for stage in left):
         warnings.append(
             f"the mesh will have about {round(cells, -4):,.0f} cells (edge length {study.mesh.edge_mm:g} mm), which "
-            "takes long to make and to simulate; a heel needs about 100,000 for a first look. For fewer, give a larger "
-            "edge_mm under [mesh], such as 4, or a label map with larger voxels."
+            "takes long to make and to simulate; 80,000 are enough for a first look at a heel. For fewer, give a "
+            "larger edge_mm under [mesh], such as 4, or a label map with larger voxels."
         )
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:

@@ -173,8 +173,8 @@ def _reached(outcome: StageOutcome) -> bool:
 def _summary(errors: dict[str, tuple[TissueError, ...]], done: StudyRun) -> list[str]:
     fat = {load: e for load, rows in errors.items() for e in rows if e.tissue == "fat"}
     lines = [
-        "Registration verdicts: " + "; ".join(f"{load}: {v.words}" for load, v in done.verdicts.items()),
-        "RMS error of the max. shear in fat (true 95th percentile in brackets): "
+        "Verdicts on the registrations: " + "; ".join(f"{load}: {v.words}" for load, v in done.verdicts.items()),
+        "RMSE of the max. shear in fat (true 95th percentile in brackets): "
         + ", ".join(f"{load} {e.shear_rmse:.3f} ({e.true_p95:.2f})" for load, e in fat.items()),
     ]
     lines += [

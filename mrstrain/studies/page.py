@@ -216,5 +216,5 @@ def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:
         result = _result(one.result)
         seconds = None if one.record is None else one.record.seconds
         rows.append((name, one.status, seconds, "\n".join((reason, *result)).strip()))
-    note = "Wall time of the run that made the result, on one core, while other stages were running."
+    note = "Wall time of the run that made the result: on one core while other stages ran; of compare, on all cores."
     return Section("Stages", None, (Table("Stages", ("stage", "status", "time, s", "summary"), tuple(rows), note),))

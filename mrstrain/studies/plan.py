@@ -14,6 +14,7 @@ from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
 from mrstrain.options.measurement import EngineOptions, command_parts
 from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, PlateOptions, SimulationOptions
+from mrstrain.records.inputs import made_beside
 from mrstrain.studies.file import Study
 from validate import LEVELLED
 
@@ -223,7 +224,8 @@ def _variation(study: Study, simulation: Stage) -> Stage:
         "uncertainty": spread,
     }  # fmt: skip
     after = dict.fromkeys((*simulation.after, *((COARSE,) if coarse else (simulation.name,)), *_labelled(study)))
-    files = (*simulation.files, *study.given([labels, names]))
+    beside = made_beside(labels) if study.given([labels]) else ()
+    files = (*simulation.files, *study.given([labels, names]), *beside)
     return Stage(f"vary {folder.name}", {**simulation.arguments, **own}, files, (out,), tuple(after))
 
 

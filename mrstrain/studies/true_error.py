@@ -68,7 +68,10 @@ def error_against_truth(study: Study, outcomes: Mapping[str, StageOutcome]) -> l
     figures = tuple(
         (load, one.tissue, *(getattr(one, key) for key in _FIGURES)) for load, of in known.items() for one in of
     )
-    note = "All bones are rigid: their true shear is zero. The registration keeps only one of them rigid."
+    note = (
+        "p95: 95th percentile. All bones are rigid: their true shear is zero. The registration keeps only one of them "
+        "rigid."
+    )
     if old := dict.fromkeys(row["load"] for row in rows if row["load"] not in known):
         note += f" Unknown for {', '.join(old)}, registered again since; `mrstrain demo` computes the error."
     table = Table("Error of max. shear and displacement, by load and tissue", _COLUMNS, figures, note)

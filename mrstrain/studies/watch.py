@@ -62,7 +62,7 @@ class Report:
         told = (
             f"Interrupted at {when}: {state}. mrstrain run resumes it." if interrupted
             else f"In progress, at {when}: {state}, about {duration(left_s)} left. This page is updated every minute "
-            "and reloads itself. If that time is some minutes ago, the run was killed; mrstrain run resumes it."
+            f"and reloads itself. If it is minutes after {when}, the run was killed; mrstrain run resumes it."
         )  # fmt: skip
         write_page_in_progress(self.path, self.study, names, outcomes, under_way, told, ended=interrupted)
         self._show(outcomes[name] for load in self.study.loads if (name := f"register {load}") in outcomes)

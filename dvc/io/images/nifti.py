@@ -95,7 +95,9 @@ def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
         if len(sizes) == 3:
             _log.info("%s: a file of 4 or more dimensions with one volume; read as 3D", path)
     if min(sizes) < 1:
-        raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
+        raise ImageFileError(
+            f"{path}: the header gives the image sizes {sizes}; all must be positive. Export it again."
+        )
     if len(sizes) < 3:
         raise ImageFileError(
             f"{path}: the image is {len(sizes)}D, {sizes} voxels; a 3D image is needed. Give all slices in one file."

@@ -136,7 +136,9 @@ def grid_of_axes(
     with np.errstate(over="ignore"):
         spacing = np.linalg.norm(columns, axis=0)
     if not np.isfinite(spacing).all() or np.any(spacing <= 0):
-        raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
+        raise ImageFileError(
+            f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive. Export it again."
+        )
     direction = columns / spacing
     if single_precision:
         left, stretch, right = np.linalg.svd(direction)
@@ -151,7 +153,9 @@ def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> N
     """Refuse an image that takes more than `max_bytes` in single precision, or has a size that is not positive."""
     sizes = [int(n) for n in shape]
     if min(sizes) < 1:
-        raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
+        raise ImageFileError(
+            f"{path}: the header gives the image sizes {sizes}; all must be positive. Export it again."
+        )
     estimate = 4 * int(np.prod(sizes, dtype=object))
     if estimate > max_bytes:
         raise ImageFileError(

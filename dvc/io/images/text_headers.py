@@ -86,7 +86,8 @@ def read_nrrd_header(
         )
     steps = _steps(path, fields)
     if len(steps) != len(sizes):
-        raise ImageFileError(f"{path}: the NRRD header gives {len(sizes)} sizes and {len(steps)} space directions.")
+        count = f"{len(sizes)} sizes and {len(steps)} space directions"
+        raise ImageFileError(f"{path}: the NRRD header gives {count}; they must be equal in number. Export it again.")
     axes = {axis: step for axis, step in enumerate(steps) if step is not None}
     others = [axis for axis, step in enumerate(steps) if step is None]
     if len(axes) != 3 or len(others) > 1:
@@ -178,7 +179,8 @@ def _vector(path: Path, written: str, field: str) -> FloatArray:
             vector = numbers(match.groups())
             if np.isfinite(vector).all():
                 return vector
-    raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
+    what = f"the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'"
+    raise ImageFileError(f"{path}: {what}. Export it again.")
 
 
 def read_meta_header(
@@ -269,7 +271,8 @@ def _numbers_in(path: Path, text: str, field: str, count: int | None = None) -> 
     with suppress(ValueError):
         found = numbers(text.replace(",", " ").split()).tolist()
     if not found or not np.isfinite(found).all() or (count is not None and len(found) != count):
-        raise ImageFileError(f"{path}: the header's '{field}' is missing or not a list of numbers: '{text[:60]}'.")
+        what = f"the header's '{field}' is missing or not a list of numbers: '{text[:60]}'"
+        raise ImageFileError(f"{path}: {what}. Export it again.")
     return found
 
 

@@ -74,4 +74,4 @@ def test_the_fraction_is_told_for_which_the_factor_was_found():
     own = replace(TABLE, widening=2.0)
     assert "a factor of 2.0, to contain 95 % of the true values in the parts" in error_bars._held(own)
     shipped = error_bars._held(replace(own, widening_of={"fat": 3.0, "skin": 4.0}))
-    assert "a factor of 3.0 to 4.0, to contain 97 % (95 % and a margin for other motions) of the true values" in shipped
+    assert "a factor of 3.0 to 4.0 (all soft tissue: 2.0), to contain 97 % (95 % and a margin" in shipped

@@ -227,7 +227,7 @@ def test_a_repeat_scan_has_what_applies_to_it_alone(tiny_pair, measured):
     sections = [one.section(dict.fromkeys(("strain", "curves"), Picture("", "", PNG))) for one in (loaded, repeat)]
     titles = [[table.title for table in section.tables] for section in sections]
     assert set(titles[0]) - set(titles[1]) >= {"Regularisation weights"}
-    assert set(titles[1]) == {"Key results", "Maximum shear strain by region"}
+    assert set(titles[1]) == {"Key results", "Percentiles and volumes of the maximum shear strain"}
     (note,) = [table.note for table in sections[1].tables if table.title == "Key results"]
     assert (
         note == "The regularisation weights of a repeat scan are fixed, so that its noise floor is not smoothed away."
@@ -252,8 +252,8 @@ def test_images_that_were_aligned_as_a_whole_have_no_figures_of_a_bone(stretched
     assert "Rotation of the body" in rows["image"]
     assert "bone" not in rows["image"]
     assert stretched.drawings()["strain"].caption.endswith(
-        "Slices through the middle of the tissue. The scale ends at 0.1: the 99th percentile of the measured strain, "
-        "rounded up to a multiple of 0.05, but at least 0.05 and at most 0.5. Larger values have the last colour."
+        "Slices through the middle of the tissue. The scale ends at 0.1 (99th percentile of the measured strain, "
+        "rounded up; at most 0.5). Larger values have the last colour."
     )
 
 

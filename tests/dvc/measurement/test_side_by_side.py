@@ -54,7 +54,7 @@ def test_each_load_has_its_own_strain_in_soft_tissue_alone(subject: Subject, fol
     titles, strains, caption = panels(subject, folders)
     assert titles == ["Load0", "Load1", "Load2"]
     # Sagittal at the first of the bone's lowest voxels, x = 3 mm: superior is up, anterior on the left.
-    assert "Sagittal, x = 3 mm, through the lowest point of the bone." in caption
+    assert "Sagittal, x = 3 mm, through the point of the bone nearest to the plate." in caption
     body, bone, valid = np.zeros((14, 12), dtype=bool), np.zeros((14, 12), dtype=bool), np.ones((14, 12), dtype=bool)
     body[1:-1, 1:-1] = bone[14 - 10 : 14 - 6, 4:8] = True
     valid[-3:] = False
@@ -102,8 +102,8 @@ def test_pictures_of_single_loads_get_the_colours_of_the_load_with_most_strain(
     weak, strong = on_one_scale(before, subject, folders)
     assert shared_scale(folders.values()) == 0.35
     assert strong is before[1]  # its own scale ends there
-    assert "The scale ends at 0.05: " in before[0].pictures[0].caption
-    assert "one colour scale. It ends at 0.35: " in weak.pictures[0].caption
+    assert "The scale ends at 0.05 (" in before[0].pictures[0].caption
+    assert "one colour scale. It ends at 0.35 (" in weak.pictures[0].caption
     assert weak.pictures[0].png != before[0].pictures[0].png
     third = folders["Load1"].with_name("Load3")
     third.mkdir()

@@ -153,7 +153,7 @@ def test_the_report_needs_nothing_else_and_says_what_it_rests_on(plain) -> None:
     assert parser.found == []
     assert len(re.findall("<figure>", page)) == 5 * len(LOADS) + 2
     assert page.count("Agreement by distance to bone") == len(LOADS)
-    assert page.count("The slice goes through the lowest point of bone.") == len(LOADS)
+    assert page.count("The slice goes through the point of the bone nearest to the plate.") == len(LOADS)
     assert len(re.findall('<figure class="viewer">', page)) == len(LOADS)
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
     assert policy is not None

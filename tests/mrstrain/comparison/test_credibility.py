@@ -113,7 +113,9 @@ def test_what_this_comparison_holds_is_filled_in(tmp_path: Path) -> None:
     assert CODE in evidence["Code verification results"]
     assert "Code verification of ansys: not given." in evidence["Code verification results"]
     vivo = evidence["In vivo validation results"]
-    assert vivo.startswith("Verdicts on the measurement: Load1 Trust. Best match over all loads (area metric): trebbi.")
+    assert vivo.startswith(
+        "Verdicts on the registrations: Load1 Trust. Best match over all loads (area metric): trebbi."
+    )
     assert "its interval of 95 % coverage: trebbi 1.00 (0.50 to 1.50), luboz 1.00 (0.50 to 1.50), ansys" in vivo
     assert COMPARATOR in vivo
     assert "Mesh convergence: not given (mrstrain converge)" in vivo

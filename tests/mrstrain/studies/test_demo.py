@@ -104,10 +104,10 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     errors = {x.name: (TissueError("fat", 9, 0.1, 0.44, 0.0221, 0.0, 0.1, 0.1, 0.2, 0),) for x in LOADS}
     lines = _summary(errors, StudyRun(study, outcomes))
     assert len(lines) == 5
-    assert lines[0].startswith("Registration verdicts: ")
+    assert lines[0].startswith("Verdicts on the registrations: ")
     assert "Load1: Trust" in lines[0]
     assert "Load3: Use with care" in lines[0]
-    assert lines[1].startswith("RMS error of the max. shear in fat (true 95th percentile in brackets): ")
+    assert lines[1].startswith("RMSE of the max. shear in fat (true 95th percentile in brackets): ")
     assert "Load4 0.022 (0.44)" in lines[1]
     assert lines[2:4] == ["All loads, area in mL: trebbi 2.5", "Best match over all loads (area metric): trebbi."]
     assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
@@ -149,7 +149,7 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     found = [what for case, what, fraction in told if case == "register Load2" and fraction == 1.0]
     assert re.fullmatch(r"max\. shear in \w+ [\d.]+ median, [\d.]+ at the 95th percentile; .*", *found)
     assert not shown.complete  # the rest has no result
-    assert shown.lines[0].startswith("Registration verdicts: Load2: ")
+    assert shown.lines[0].startswith("Verdicts on the registrations: Load2: ")
     error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) \(([\d.]+)\)", shown.lines[1]).groups())
     assert 0.0 < error < 0.5 * true
     labels = read_labels(tmp_path / "demo" / "tissues.nii.gz", tmp_path / "demo" / "tissues.csv")

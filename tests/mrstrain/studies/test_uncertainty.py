@@ -89,6 +89,21 @@ def test_further_solutions_are_stages_which_quick_leaves_out(tmp_path: Path) -> 
     assert tmp_path / "stronger" in given.files
 
 
+def test_the_probabilities_of_a_label_map_are_inputs_of_the_variants(tmp_path: Path) -> None:
+    """A map made from an image has them beside it; one that `label` makes in the study is an output already."""
+    beside = {tmp_path / name for name in ("tissues.json", "tissues_probability.json", "tissues_probability.nii.gz")}
+    assert not beside & set(planned(tmp_path, TABLE)["vary soft"].files)
+    for path in beside:
+        path.touch()
+    stages = planned(tmp_path, TABLE)
+    assert beside < set(stages["vary soft"].files)
+    assert not beside & set(stages["mesh"].files)
+    made = PLAIN.replace('"tissues.nii.gz"', '"auto"').replace('bone = "bone"', 'bone_mask = "calcaneus.nii.gz"')
+    (tmp_path / "study.toml").write_text(made + TABLE)
+    (auto,) = [stage for stage in plan(read_study(tmp_path)) if stage.name == "vary soft"]
+    assert not beside & set(auto.files)
+
+
 @pytest.mark.parametrize(
     ("line", "told"),
     [("mesh = 1.05", "1.2 to 2.5 times as long"), ("force = -0.1", "greater than or equal to 0"),
