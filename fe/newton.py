@@ -14,8 +14,8 @@ _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # residual, as a fraction of the support forces, below which contact is updated
 LEAST_VOLUME = 0.002  # lower bound on det F at the quadrature points in any step: below it a cell is about to fold
 _MOST_GROWTH = 3.0  # of the residual in one step
-# Consecutive steps that hardly lowered the residual: from the first number on, several step lengths are tried; at the
-# second the search stops.
+# Consecutive steps that hardly lowered the residual, from which on several step lengths are tried; and steps since it
+# was last halved below all before, at which the search stops: it would wander to the largest number of iterations.
 _WANDERED, _LOST = 2, 12
 BALANCED, SMALL_MM = 5, 0.1  # also converged: so many consecutive steps within the force tolerance, the last this small
 _LINGERED, _CLOSE, _CLOSEST = 8, 10.0, 1e-3  # or so many within so many times the tolerance, at most this fraction
@@ -80,7 +80,7 @@ def equilibrium(
     now, left = newton.at(state.copy()), imposed.moves_mm.copy()
     if not now.lowest > 0.0:
         return None
-    wandering, balanced, close, balance = 0, 0, 0, 0.0
+    wandering, stalled, balanced, close, balance, halved = 0, 0, 0, 0, 0.0, np.inf
     for iteration in range(1, tolerance.iterations + 1):
         try:
             step = newton.step(now, left, _ROUGH if balance > _NEAR else _INEXACT)
@@ -96,8 +96,10 @@ def equilibrium(
         balance = now.unbalanced_n / max(reaction(assembler, now.forces), 1e-9)
         slow = now.unbalanced_n > 0.5 * before.unbalanced_n and balance > tolerance.force
         wandering = wandering + 1 if slow else 0
+        stays = now.unbalanced_n > 0.5 * halved and not left.any()
+        stalled, halved = (stalled + 1, halved) if stays else (0, now.unbalanced_n)
         log(f"    {iteration}: residual {balance:.1e}, step {largest:.1e} mm, smallest det F {now.lowest:.3f}")
-        if wandering >= _LOST:
+        if stalled >= _LOST:
             return None
         if left.any() or balance > _NEAR:
             close = 0

@@ -22,10 +22,10 @@ from tests.golden.reading import Quantity
 FOLDER = Path(__file__).parent / "record"
 TOLERANCE = 1e-7
 """Of figures, over the quantity's root mean square; files that keep fewer digits are held to theirs (``_digits``)."""
-ELSEWHERE = {"phantom": 1e-6} | dict.fromkeys(("smooth", "interfaces", "elastix", "study"), 1e-3)
+ELSEWHERE = {"phantom": 1e-6, "study": 1e-2} | dict.fromkeys(("smooth", "interfaces", "elastix"), 1e-3)
 """The same on other machines than the record's, of maps in single precision and of scenes that register: iterations
 that stop at a small step stop elsewhere. With instructions of another processor displacement moved by 1e-5, an
-interval's share of volume by 3e-4."""
+interval's share of volume by 3e-4. Few cells make a study's curve: one that passes a threshold moved it by 5e-3."""
 _PACKAGES = ("numpy", "scipy", "numba", "itk-elastix", "SimpleITK", "scikit-image", "pypardiso", "mkl")
 _PERCENTILES = (5, 50, 95)
 _FEW = 16
