@@ -70,7 +70,7 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
     """Maximum shear strain in a slice along the plate's normal and the shear.
 
     The slice goes through the point of the bone nearest to the plate. If loads have their own directions, those of the
-    first load are used. Cells are cut in the unloaded configuration and drawn in their deformed position; the dashed
+    first load are used. Cells are cut in the reference configuration and drawn in their deformed position; the dashed
     line is the plate. The colour scale ends at the 99th percentile (by volume) over all loads.
     """
     axes = states[0].plate_axes

@@ -14,8 +14,8 @@ _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # residual, as a fraction of the support forces, below which contact is updated
 LEAST_VOLUME = 0.002  # lower bound on det F at the quadrature points in any step: below it a cell is about to fold
 _MOST_GROWTH = 3.0  # of the residual in one step
-# Consecutive steps that hardly lowered the residual, from which on several step lengths are tried; and steps since it
-# was last halved below all before, at which the search stops: it would wander to the largest number of iterations.
+# Consecutive steps that hardly lowered the residual, from which on several step lengths are tried; and steps within
+# which it must fall to half of what it was when it last did so, or the search stops (unless it is nearly converged).
 _WANDERED, _LOST = 2, 12
 BALANCED, SMALL_MM = 5, 0.1  # also converged: so many consecutive steps within the force tolerance, the last this small
 _LINGERED, _CLOSE, _CLOSEST = 8, 10.0, 1e-3  # or so many within so many times the tolerance, at most this fraction
@@ -37,7 +37,7 @@ class Tolerance:
         may move almost without force.
     iterations : int
         Largest number of iterations; at most 15 below half of the normal load with a material that is far from every
-        published one.
+        published one. A search ends earlier if the residual does not halve within 12 iterations.
     """
 
     force: float = 1e-4
@@ -99,7 +99,8 @@ def equilibrium(
         stays = now.unbalanced_n > 0.5 * halved and not left.any()
         stalled, halved = (stalled + 1, halved) if stays else (0, now.unbalanced_n)
         log(f"    {iteration}: residual {balance:.1e}, step {largest:.1e} mm, smallest det F {now.lowest:.3f}")
-        if stalled >= _LOST:
+        within = balance <= max(tolerance.force, min(_CLOSE * tolerance.force, _CLOSEST))
+        if (stalled >= _LOST and not within) or (wandering >= _LOST and left.any()):
             return None
         if left.any() or balance > _NEAR:
             close = 0
@@ -108,7 +109,7 @@ def equilibrium(
             now, balanced, close = newton.at(now.state), 0, 0
             continue
         balanced = balanced + 1 if balance <= tolerance.force else 0
-        close = close + 1 if balance <= max(tolerance.force, min(_CLOSE * tolerance.force, _CLOSEST)) else 0
+        close = close + 1 if within else 0
         if balanced and share == 1.0 and largest <= tolerance.step_mm:
             return Converged(now.state, now.forces, iteration)
         if (balanced >= BALANCED or close >= _LINGERED) and largest <= share * SMALL_MM:

@@ -133,7 +133,11 @@ def validation_section(load: str, errors: Sequence[ComparisonError], tissue: str
     ]
     known_as = {"u_num": "Uncertainty of the mesh (u_num)", "u_input": "Uncertainty of the inputs (u_input)"}
     words += [f"{known_as[u]} not given: {', '.join(dict.fromkeys(of))}." for u, of in lacking.items() if of]
-    words += ["To have them computed, give [uncertainty] in the study file."] * any(lacking.values())
+    if any(lacking.values()):
+        words.append(
+            "For material sets that a study simulates, [uncertainty] in the study file computes them; for other "
+            "models, give variants."
+        )
     if unknown := dict.fromkeys(one.statistic for one in statistics if np.isnan(one.error)):
         words.append(f"D and E are not defined beyond the range of the measured curves: {', '.join(unknown)}.")
     columns = ("model", "quantity", "S", "D", "E = S - D", "u_num", "u_input", "u_D", "u_val", "E, lower", "upper")

@@ -79,7 +79,7 @@ class LoadCase:
         Of the plate, LPS, the first in the direction of its normal force; see `dvc.plate_axes`. By default the plate
         presses in superior and shears in anterior direction.
     error, verdict : ErrorTable, Verdict, or None
-        Error of the measured maximum shear strain, and the verdict on the measurement. Without the error, results have
+        Error of the measured maximum shear strain, and the verdict on the registration. Without the error, results have
         no intervals and no difference is significant.
     aligned_on : str
         What was aligned rigidly: "bone", "image" or "none"; empty if unknown.

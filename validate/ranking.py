@@ -23,7 +23,8 @@ Pairs = tuple[tuple[str, str], ...]
 ALL_LOADS = "all loads"
 _SURE, _LEVEL, _HIGH = 0.95, 0.975, 0.95
 
-_OVER_LOADS = "over all loads"
+OVER_LOADS = "over all loads"
+"""In the statement over all loads, if there is one."""
 CLOSER = 0.95
 """A model is better than `NOTHING` if its area is smaller than this fraction of it."""
 
@@ -94,7 +95,7 @@ def rank_over_loads(loads: Sequence[LoadComparison], odd: Sequence[Misfit] = ())
         caveat = f" It includes {', '.join(distrusted)}, whose registration has the verdict Do not trust."
         caveat = caveat * bool(distrusted) + _not_trusted(odd)
         strains = loads[0].criteria.strains
-        statements.insert(0, _statement(_OVER_LOADS, ranked, nothing, pairs[ALL_LOADS], caveat, strains))
+        statements.insert(0, _statement(OVER_LOADS, ranked, nothing, pairs[ALL_LOADS], caveat, strains))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs, tuple(uninformative))
 
 
@@ -198,7 +199,7 @@ def _statement(
     near = [b for a, b in pairs if a == best.model]
     of_all = f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other."
     between = f"Area between its strain-volume curve and the measured one{over}" if over else "Area"
-    between += ", summed over the loads" * (where == _OVER_LOADS)
+    between += ", summed over the loads" * (where == OVER_LOADS)
     worse = " It is no better than a model without deformation (by 5 %)." * (best.model in no_nearer(ranked, nothing))
     return f"Best match {where} (area metric): {best.model}{of_all} {between}: {area}; {scale}{worse}{caveat}"
 

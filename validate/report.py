@@ -157,11 +157,12 @@ def _viewer(
     if scanned is not None:
         seen, voxels = read_voxels(scanned)
         shown = np.nan_to_num(voxels[box]) if seen.same_as(labels.grid) else shown
+    best = " (smallest area under this load)" * (len(one.ranked()) > 1)
     return Viewer(
         "Interactive 3-D viewer",
-        f"Maximum shear strain, 0 to {most:g}, in the reference configuration: measured, and simulated by {model.name} "
-        "(smallest area under this load). Behind it: the registered image of the first load. Drag to move through the "
-        "slices; drag with the right button to rotate. Both views move together. The viewer needs WebGL 2.",
+        f"Maximum shear strain, 0 to {most:g}, in the reference configuration: measured, and simulated by {model.name}"
+        f"{best}. Behind it: the registered image of the first load. Drag to move through the slices; drag with the "
+        "right button to rotate. Both views move together. The viewer needs WebGL 2.",
         Volume.image("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
         (Volume.overlay("measured", grid, shear[0], most), Volume.overlay(model.name, grid, shear[1], most)),
     )

@@ -66,8 +66,8 @@ def measure(
     mesh : MeshFile, optional
         Mesh at whose nodes and cells displacement and strain are written.
     plate_normal, shear_direction : (3,), optional
-        LPS. Figures cut through the lowest point of the bone along the plate's outward normal (default: inferior). With
-        a shear direction, strain is also written in the axes of the plate.
+        LPS. Figures cut through the point of the bone nearest to the plate (default: inferior). With a shear direction,
+        strain is also written in the axes of the plate.
     name : str
         Name of the load.
     worker : Worker, optional

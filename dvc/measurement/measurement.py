@@ -65,7 +65,7 @@ class Measurement:
     source : Source or None
         What it was made from; None if read from a folder.
     shown_mm : (3,) or None
-        Point where the slices in figures meet, LPS mm: the lowest point of the bone; None: the middle of the tissue.
+        Point where the slices in figures meet, LPS mm: where the bone is nearest to the plate; None: amid the tissue.
     is_repeat : bool
         Whether it is of a repeat scan, whose strain is the noise floor.
 
@@ -288,7 +288,7 @@ class Measurement:
             strain: "xx", "xy", "xz", "yy", "yz", "zz".
         planes : sequence of {"sagittal", "coronal", "axial"}
         point_mm : (3,), optional
-            Point where the planes meet, LPS mm; by default the lowest point of the bone, or the middle of the tissue.
+            Point where the planes meet, LPS mm; by default where the bone is nearest to the plate, or amid the tissue.
         largest : float, optional
             Upper end of the colour scale, in the unit of the quantity; by default just above the 99th percentile.
 
@@ -396,5 +396,5 @@ class Measurement:
         return self.source
 
     def _view(self, point_mm: npt.ArrayLike | None = None) -> View:
-        """The slices through a point, through the bone's lowest point, or through the tissue's middle."""
+        """The slices through a point, through the bone's nearest to the plate, or through the tissue's middle."""
         return View.through(self.maps.grid, self.shown_mm if point_mm is None else point_mm, self.maps.valid)

@@ -27,6 +27,7 @@ from mrstrain.options.credibility import CredibilityOptions
 from mrstrain.records.provenance import versions
 from validate import ALL, NOTHING, Comparison
 from validate.curves import range_told
+from validate.ranking import OVER_LOADS
 
 TITLE = "Credibility (ASME V&V 40, FDA)"
 """Title of the section of a report."""
@@ -61,7 +62,7 @@ _ASSUMED = (
 
 @dataclass(frozen=True, slots=True)
 class Holdings:
-    """What was compared: models, verdicts on the measurement by load, and the comparison, if there is one."""
+    """What was compared: models, verdicts on the registrations by load, and the comparison, if there is one."""
 
     models: tuple[ModelFacts, ...]
     verdicts: Mapping[str, Verdict | None]
@@ -145,12 +146,15 @@ def _evidence(held: Holdings) -> Table:
 
 
 def _validation(held: Holdings) -> str:
-    """The comparison with the measured strain: verdicts, statements, and the area of each model with its interval."""
+    """Verdicts, the statement over all loads (or those of each load), and the area of each model with its interval."""
     verdicts = "; ".join(f"{load} {verdict.words}" for load, verdict in held.verdicts.items() if verdict is not None)
     of = f"Verdicts on the registrations: {verdicts or NOT_GIVEN}"
     if held.comparison is None:
         return f"{of}. Comparison with models: {NOT_GIVEN}"
-    return _sentences(of, *held.comparison.ranking.statements[:1], _areas(held, held.comparison))
+    told = held.comparison.ranking.statements
+    if told and OVER_LOADS in told[0]:  # the others, of single loads, are elsewhere in the report
+        told = told[:1]
+    return _sentences(of, *told, _areas(held, held.comparison))
 
 
 def _areas(held: Holdings, comparison: Comparison) -> str:

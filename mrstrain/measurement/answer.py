@@ -79,7 +79,7 @@ def most_strained(table: Table | None, beside: MeasuredBeside = NOTHING_BESIDE) 
         told += f" The 95th percentile may be as large in {listed(overlapping)}, since the intervals overlap."
     if beside.floor is not None:
         noise = f"{beside.floor.max_shear_p50:.3f} (median) and {beside.floor.max_shear_p95:.3f} (95th percentile)"
-        told += f" The noise floor, in all tissue but the bone, is {noise}."
+        told += f" The noise floor (tissue outside the bone mask, if there is one) is {noise}."
     return told
 
 

@@ -19,10 +19,8 @@ from dvc.own_files import read_json
 from dvc.report.drawing import ENDINGS
 from dvc.report.page import Section
 from dvc.report.sheet import View
-from mrstrain.records.inputs import alone, image_stem, made_from_image, output_folder
+from mrstrain.records.inputs import WRITTEN, alone, image_stem, made_from_image, output_folder
 from mrstrain.records.outcome import Outcome
-
-_WRITTEN = (".nii.gz", ".nii", ".nrrd", ".mha")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +42,9 @@ class LabelFiles:
     def of(cls, out: Path | str, inputs: Sequence[Path]) -> Self:
         """The files of an output; InputError for an unknown format, OutputError if an input would be overwritten."""
         target = Path(out)
-        ending = next((one for one in _WRITTEN if target.name.lower().endswith(one)), None)
+        ending = next((one for one in WRITTEN if target.name.lower().endswith(one)), None)
         if ending is None:
-            raise InputError(f"The output (out) is the label map and must end in {', '.join(_WRITTEN)}; got {target}.")
+            raise InputError(f"The output (out) is the label map and must end in {', '.join(WRITTEN)}; got {target}.")
         files = cls(target, ending)
         written = [target, files.probability, *map(files.beside, (".csv", ".json", "_probability.json", *ENDINGS))]
         for path in inputs:

@@ -37,9 +37,9 @@ class ComparisonLabels(Options):
     names: Path | None = None
     """Table of the label names: ITK-SNAP, Slicer or CSV. Default: that of the measurement, unless --labels is given."""
     bones: Annotated[Names, Cli("--bone")] = ()
-    """Name of a bone label, which is not compared; slices in figures go through the lowest point of the first bone.
-    Default: the bone label of the measurement, if it had one and --labels is not given; otherwise every label that is
-    named like a bone, such as bone, calcaneus or talus."""
+    """Name of a bone label, which is not compared; slices in figures go through the first bone, where it is nearest to
+    the plate. Default: the bone label of the measurement, if it had one and --labels is not given; otherwise every
+    label that is named like a bone, such as bone, calcaneus or talus."""
 
 
 class Finer(NamedTuple):

@@ -38,6 +38,8 @@ _NAMES_BESIDE = (
     "the command line)."
 )
 TABLE_ENDINGS = (".csv", ".txt", ".label", ".ctbl")
+WRITTEN = (".nii.gz", ".nii", ".nrrd", ".mha")
+"""Formats of label maps that are made."""
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 
 
@@ -109,8 +111,8 @@ def made_from_image(labels: Path) -> LabelsFromImage | None:
 
 def made_beside(labels: Path) -> tuple[Path, ...]:
     """Files that lie beside a label map that `label` made, and belong to it: its record and its probabilities."""
-    stem = image_stem(labels.name)
-    endings = ".json", "_probability.json", f"_probability{labels.name.removeprefix(stem)}"
+    stem, ending = image_stem(labels.name), next((e for e in WRITTEN if labels.name.lower().endswith(e)), "")
+    endings = ".json", "_probability.json", f"_probability{ending}"
     return tuple(path for ending in endings if (path := labels.with_name(stem + ending)).is_file())
 
 

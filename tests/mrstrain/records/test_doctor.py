@@ -176,7 +176,7 @@ def test_a_registration_that_finds_another_shift_fails_its_trial(monkeypatch: py
     monkeypatch.setattr(self_test, "register", lambda fixed, moving, **given: whole(moving, fixed, **given))
     (told,) = (one for one in examine(trials={"registration": self_test.self_test}) if one.what.startswith("trial"))
     assert not told.ok
-    assert "a shift of 0.5 mm was measured as -0.4" in told.detail
+    assert "a shift of 0.5 mm was measured as -0.5" in told.detail
 
 
 def test_a_busy_machine_is_slow_and_not_at_fault(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,7 +127,8 @@ def test_the_most_strained_tissue_is_surely_so() -> None:
     assert most_strained(Table("Measured", columns, rows), beside) == (
         "Maximum shear strain in fat, the most strained tissue, under Load1 (140 N): median 0.300 (0.200 to 0.400), "
         "95th percentile 0.419 (0.400 to 0.500), with 95 % intervals in brackets. The 95th percentile may be as large "
-        "in muscle, since the intervals overlap. The noise floor, in all tissue but the bone, is "
+        "in muscle, since the intervals overlap. The noise floor (tissue outside the bone mask, if there "
+        "is one) is "
         "0.011 (median) and 0.029 (95th percentile)."
     )
     below_zero = ("Load2", "tendon", fat[0], Estimate(0.5, (-0.45, 0.759)))

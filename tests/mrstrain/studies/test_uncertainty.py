@@ -98,6 +98,10 @@ def test_the_probabilities_of_a_label_map_are_inputs_of_the_variants(tmp_path: P
     stages = planned(tmp_path, TABLE)
     assert beside < set(stages["vary soft"].files)
     assert not beside & set(stages["mesh"].files)
+    (tmp_path / "tissues_probability.nrrd").touch()  # as `label` names it, whatever the ending of the label map
+    (tmp_path / "study.toml").write_text(PLAIN.replace("tissues.nii.gz", "tissues.SEG.nrrd") + TABLE)
+    named = {path.name for stage in plan(read_study(tmp_path)) if stage.name == "vary soft" for path in stage.files}
+    assert {"tissues.json", "tissues_probability.nrrd"} < named
     made = PLAIN.replace('"tissues.nii.gz"', '"auto"').replace('bone = "bone"', 'bone_mask = "calcaneus.nii.gz"')
     (tmp_path / "study.toml").write_text(made + TABLE)
     (auto,) = [stage for stage in plan(read_study(tmp_path)) if stage.name == "vary soft"]
