@@ -99,8 +99,8 @@ def equilibrium(
         stays = now.unbalanced_n > 0.5 * halved and not left.any()
         stalled, halved = (stalled + 1, halved) if stays else (0, now.unbalanced_n)
         log(f"    {iteration}: residual {balance:.1e}, step {largest:.1e} mm, smallest det F {now.lowest:.3f}")
-        within = balance <= max(tolerance.force, min(_CLOSE * tolerance.force, _CLOSEST))
-        if (stalled >= _LOST and not within) or (wandering >= _LOST and left.any()):
+        near = balance <= max(tolerance.force, min(_CLOSE * tolerance.force, _CLOSEST))
+        if (stalled >= _LOST and not near) or (wandering >= _LOST and left.any()):
             return None
         if left.any() or balance > _NEAR:
             close = 0
@@ -109,7 +109,7 @@ def equilibrium(
             now, balanced, close = newton.at(now.state), 0, 0
             continue
         balanced = balanced + 1 if balance <= tolerance.force else 0
-        close = close + 1 if within else 0
+        close = close + 1 if near else 0
         if balanced and share == 1.0 and largest <= tolerance.step_mm:
             return Converged(now.state, now.forces, iteration)
         if (balanced >= BALANCED or close >= _LINGERED) and largest <= share * SMALL_MM:

@@ -48,7 +48,7 @@ def _tiny_pair() -> tuple[Image, Image, LabelMap]:
     for first in (1, 0):
         seen = bright[first : first + 2 * _SIZE : 2, : 2 * _SIZE : 2, : 2 * _SIZE : 2]
         images.append(Image(grid, seen + 20.0 * _NOISE * random.normal(size=grid.shape)))
-    depth = _depth(np.indices(grid.shape))
+    depth = _depth(np.indices(grid.shape, dtype=np.float64))
     labels = LabelMap(grid, np.digitize(depth, (2, 4, _BONE_FROM)), {1: "skin", 2: "fat", 3: "bone"})
     return images[0], images[1], labels
 
