@@ -46,7 +46,7 @@ MOTIONS = {
     "trebbi": "material set trebbi", "akrami": "material set akrami", "stiff-skin": "stiff skin",
     "soft-skin": "soft skin", "stiff-fat": "stiff fat", "stiff-muscle": "stiff muscle", "lobules": "fat in lobules",
     "lobules at 1.2 mm": "the same, 1.2 mm", "slipping": "plate without tape", "loads": "Load3 (seen)",
-    "sliding": "sliding pad (seen)",
+    "sliding": "sliding fat pad (seen)",
 }  # fmt: skip
 SEEN = ("loads", "sliding")
 """Motions of the accuracy study itself; all others are of finite-element models."""
