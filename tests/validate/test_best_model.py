@@ -56,7 +56,7 @@ def test_the_title_says_how_far_the_best_match_agrees(differences: tuple[float, 
     assert ("Load1 nan (not tested, beyond" in banner.paragraphs[1]) == np.isnan(differences[0])
     if differences == (0.05, 0.01):
         assert "Load1 0.450 against 0.400 (too high), Load2 0.410 against 0.400. " in banner.paragraphs[1]
-        assert "the uncertainty of the mesh (u_num) and the inputs (u_input) is not given" in banner.paragraphs[1]
+        assert "The uncertainty of the mesh (u_num) and the inputs (u_input) is not given" in banner.paragraphs[1]
 
 
 def test_the_title_says_which_models_are_as_near_and_that_none_may_be_near() -> None:

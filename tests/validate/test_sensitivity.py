@@ -217,4 +217,4 @@ def test_a_model_is_called_wrong_only_where_its_mesh_and_inputs_are_known() -> N
     assert "The model form is the likely cause" in said(error(0.001, 0.002))
     for lacking in (error(np.nan, 0.002), error(0.001, np.nan)):
         assert "wrong" not in said(lacking)
-        assert "that are not given below may" in said(lacking)
+        assert "not given (next lines) may" in said(lacking)
