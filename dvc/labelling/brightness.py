@@ -6,15 +6,15 @@ import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.special import ndtr
 from skimage.filters import threshold_otsu
-from skimage.restoration import denoise_tv_chambolle
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.labelling.total_variation import with_short_borders
 
 _BLUR_MM = 1.2  # before the two levels are found: more than the noise and the texture of a tissue
 _BORDER_MM = 0.64  # weight of a border's area, against the volume on its wrong side
 _LEAST_SEPARATION = 0.7  # share of the variance between both tissues; 0.64 for one tissue with normal texture
 _SPREAD = 0.12  # standard deviation of the division's brightness about the middle, in steps between both levels
-_ITERATIONS, _CONVERGED = 250, 1e-6
+_ITERATIONS, _CONVERGED = 200, 2e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,15 +55,17 @@ def two_levels(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -
 
 
 def brighter_share(
-    values: Float32Array, where: BoolArray, levels: Levels, spacing_mm: FloatArray, border_mm: float = _BORDER_MM
-) -> FloatArray:
+    values: Float32Array, where: BoolArray, levels: Levels, spacing_mm: FloatArray, border_mm: float = _BORDER_MM,
+    beside: float = 0.0,
+) -> FloatArray:  # fmt: skip
     """Probability of the brighter of two tissues, (ni, nj, nk); a half outside ``where``.
 
     Divided at a half, this is the division with the least sum of voxels on the wrong side of the middle, each counted
     by how far it is from there, and area of the border (total variation; A. Chambolle 2005, doi:10.1007/11585978_10).
-    Borders count by voxels, in all directions alike.
+    Borders count by voxels, in all directions alike. ``beside`` stands for the brightness outside ``where``, from -1
+    (the darker tissue) to 1 (the brighter one): thin layers there, dark by the skin's part of their voxels, follow it.
     """
-    told = np.where(where, np.clip((values - levels.middle) / (levels.brighter - levels.darker), -1.0, 1.0), 0.0)
+    told = np.where(where, np.clip((values - levels.middle) / (levels.brighter - levels.darker), -1.0, 1.0), beside)
     weight = border_mm / float(spacing_mm.mean())
-    smooth = denoise_tv_chambolle(told, weight=weight, max_num_iter=_ITERATIONS, eps=_CONVERGED)
-    return np.asarray(ndtr(smooth / _SPREAD))
+    smooth = with_short_borders(told, weight, _CONVERGED, _ITERATIONS)
+    return np.where(where, ndtr(smooth / _SPREAD), 0.5)

@@ -28,6 +28,7 @@ _DARK = 0.7  # of muscle's brightness: darker are cortical bone and tendon
 _SURE = 0.9
 _LEAST_IN_BODY = 0.5  # of the bone
 _LEAST_BONE = 16  # voxels
+_BESIDE = 0.04  # beside skin and bone, between muscle (-1) and fat (1): voxels there are dark by their part of skin
 _DARK_MARROW = 0.25  # of the step from muscle to fat: 0.5 and more in phantoms with slices of up to 3 mm
 
 
@@ -230,7 +231,7 @@ def _below_skin(
         if not is_bones_name(name) and name not in NAMES.values():
             tissues[name] = left * grown(values, mark & rest, rest, levels.darker, spacing_mm)
             left = left - tissues[name]
-    fat = left * brighter_share(values, rest, levels, spacing_mm).astype(np.float32)
+    fat = left * brighter_share(values, rest, levels, spacing_mm, beside=_BESIDE).astype(np.float32)
     return {"fat": fat, "muscle": left - fat} | tissues
 
 

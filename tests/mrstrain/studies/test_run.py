@@ -93,7 +93,9 @@ def test_every_result_is_there_and_the_report_tells_it(done):
     assert re.search(r"^finished after \d+ (s|min): 6 of 6 stages$", stderr, re.M)
     log = (out / "study.log").read_text()
     assert all(f"{stage}: done after" in log for stage in STAGES)
-    assert re.search(r"To do: 6 of 6 stages, about \d+ (s|min) on \d+ cores if they are idle, [\d.]+ GiB of memory", log)
+    assert re.search(
+        r"To do: 6 of 6 stages, about \d+ (s|min) on \d+ cores if they are idle, [\d.]+ GiB of memory", log
+    )
     record = json.loads((out / "provenance.json").read_text())
     assert {f["name"] for f in record["inputs"]["inputs"]} >= {"Load0.nii.gz", "tissues.nii.gz"}
 
