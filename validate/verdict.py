@@ -24,7 +24,7 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[Misfit
     registrations = {1: "The registration", 2: "Both registrations"}.get(
         len(verdicts), f"All {len(verdicts)} registrations"
     )
-    sound = f"{registrations} passed all checks. This is a verdict on the registrations; the models are judged below."
+    sound = f"{registrations} passed all checks. The models are judged below, not here."
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 

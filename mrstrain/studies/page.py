@@ -183,7 +183,7 @@ def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdic
     registrations = {1: "The registration", 2: "Both registrations"}.get(
         len(verdicts), f"All {len(verdicts)} registrations"
     )
-    models = " This is a verdict on the registrations; the models are judged below." if compared else ""
+    models = " The models are judged below, not here." if compared else ""
     return replace(verdict, reasons=(f"{registrations} passed all checks.{models}",))
 
 

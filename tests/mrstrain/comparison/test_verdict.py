@@ -67,7 +67,7 @@ def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(stu
     sound = dict.fromkeys(("Load1", "Load2"), Verdict("trust"))
     assert verdict_on(sound) == Verdict(
         "trust",
-        ("Both registrations passed all checks. This is a verdict on the registrations; the models are judged below.",),
+        ("Both registrations passed all checks. The models are judged below, not here.",),
     )
     assert verdict_on(dict.fromkeys(sound)) is None
     odd = [Misfit("Load1", "turned", "It is mirrored."), Misfit("Load1", "far", "It is far away.", "distrust")]
