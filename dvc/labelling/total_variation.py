@@ -13,9 +13,9 @@ _EVERY = 10  # iterations between two looks at how much has changed
 def with_short_borders(image: FloatArray, weight: float, tolerance: float, most: int) -> Float32Array:
     """Minimise half the square of u - image, plus the weight times the total variation of u; gives u (ni, nj, nk).
 
-    The total variation is the sum of the lengths of differences to the next voxel along each axis. Solved by the fast
-    gradient projection of A. Beck and M. Teboulle (2009, doi:10.1109/TIP.2009.2028250) on its dual: accelerated, it
-    takes a tenth of the iterations of projections without memory.
+    The total variation is the sum over voxels of the length of a vector: the differences to the next voxel along each
+    axis. Its dual is solved by the fast gradient projection of A. Beck and M. Teboulle (2009,
+    doi:10.1109/TIP.2009.2028250). The result is the same bit for bit on any number of threads.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def with_short_borders(image: FloatArray, weight: float, tolerance: float, most:
     weight : float
         In that unit, times voxels.
     tolerance : float
-        Mean change of u in ten iterations that ends them, in the unit of the image.
+        The iterations end once the mean change of u in ten of them is no larger, in the unit of the image.
     most : int
         Largest number of iterations.
     """

@@ -63,10 +63,7 @@ class Choice(Regularisation):
     @property
     def caption(self) -> str:
         """The rules by which the weights were chosen."""
-        rule = self.rule.replace("In skin, rigidity", "In skin, the weight of its strain")
-        between = self.tried and self.weights.bending not in {weight for weight, _ in self.tried}
-        told = " The bending used lies between those tried." * bool(between)
-        return f"{rule[:1].upper()}{rule[1:]}.{told} {self.volume_told}"
+        return f"{self.rule[:1].upper()}{self.rule[1:]}. {self.volume_told}"
 
     def rows(self) -> list[tuple[str, float, str, str | float]]:
         """Each weight: what it penalises, its value, its unit, and "used" or what it left out, % above the least."""

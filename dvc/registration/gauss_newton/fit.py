@@ -182,6 +182,7 @@ def choose(
         if least < best < greatest:
             below, here, above = (left_out(best + d) for d in (-1, 0, 1))
             power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
+            rule += ", interpolated between the weights tried"
         else:
             rule += "; the lowest residual is at the end of the range tried"
     chosen = replace(weights, **{name: float(usual * _RATIO**power)})

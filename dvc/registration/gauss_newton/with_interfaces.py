@@ -108,7 +108,8 @@ def fit_with_interfaces(
     choice = Choice(in_skin.weights, "bending fixed beforehand")
     if parameters.bending is None:
         choice = choose(stage.slab, coefficients, in_skin.weights)
-    rule = f"{choice.rule}. In skin, {in_skin.rule}" if stage.has_skin else choice.rule
+    in_words = in_skin.rule.replace("rigidity", "the weight of its strain")
+    rule = f"{choice.rule}. In skin, {in_words}" if stage.has_skin else choice.rule
     in_bone = None if pair.bone is None else _moved(smooth, pair.bone)
     choice = replace(
         choice, rule=rule, tried_in_skin=in_skin.tried, at_interfaces=True, asked=first.asked, coarse=first.coarse,
