@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform_edt, gaussian_filter, label, maximum
+from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform_edt, label, maximum
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.images.depth import depth_mm
+from dvc.images.filters import gaussian
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import within
@@ -115,7 +116,7 @@ def as_dark_as_rims(image: Image, bones: BoolArray, soft: BoolArray, tissues: It
     beside = within(bones, spacing, reach_of(spacing)) & within(~bones, spacing, reach_of(spacing)) & (bones | soft)
     dark = np.zeros_like(bones)
     if beside.any():
-        blurred = gaussian_filter(image.values, _BLUR_MM / spacing)
+        blurred = gaussian(image.values, _BLUR_MM / spacing)
         most = _LEAST_STEP * float(np.percentile(blurred[beside], _DARK_PERCENT))
         for tissue in tissues:
             dark |= tissue & (float(np.median(blurred[tissue])) < most)
@@ -144,18 +145,20 @@ class _Rims:
         reach_mm = reach_of(spacing_mm)
         inside, outside = (distance_transform_edt(of, sampling=spacing_mm) for of in (given, ~given))
         parts, count = label(given)
-        deepest = np.concatenate([[0.0], np.atleast_1d(maximum(inside, parts, np.arange(1, count + 1)))])
+        of_each = maximum(inside[given], parts[given], np.arange(1, count + 1))
+        deepest = np.concatenate([[0.0], np.atleast_1d(of_each)])
         core = given & (inside > np.minimum(reach_mm, 0.5 * deepest)[parts])
-        blurred = gaussian_filter(values, _BLUR_MM / spacing_mm)
+        blurred = gaussian(values, _BLUR_MM / spacing_mm)
         seeds = np.where(core, 1, np.where((outside > reach_mm) | ~(soft | given), 2, 0))
-        inner = watershed(-blurred, seeds) == 1
+        # The seeds beside what is to be divided are enough.
+        inner = (watershed(-blurred, seeds, mask=binary_dilation(seeds == 0)) == 1) | core
         near = (inside <= reach_mm) & (outside <= reach_mm) & (soft | given)
         beside = _mean_around(blurred, soft & (outside > reach_mm) & (outside < 2.0 * reach_mm), spacing_mm)
         dark = float(np.percentile(blurred[near], _DARK_PERCENT))
         as_dark = near & (blurred < dark + _EDGE * (beside - dark))
-        known = distance_transform_edt(~as_dark, sampling=spacing_mm) <= reach_mm
+        known = within(as_dark, spacing_mm, reach_mm)
         thick_mm = max(_RIM_MM, _ONE_VOXEL * float(spacing_mm.mean()))
-        rim = as_dark & (distance_transform_edt(~inner, sampling=spacing_mm) <= thick_mm)
+        rim = as_dark & within(inner, spacing_mm, thick_mm)
         found = (inner | rim) & (soft | given)
         joined, _ = label(found)
         found = np.isin(joined, np.unique(joined[core])) & found
@@ -168,7 +171,7 @@ class _Rims:
 def _mean_along(surface: BoolArray, known: BoolArray, values: FloatArray, sigma: FloatArray) -> FloatArray:
     """Mean of values that are known at some voxels of a surface, around each voxel; near 0 where few are known."""
     of_all, share, total = (
-        gaussian_filter(of, sigma, mode="constant", truncate=_TRUNCATE)
+        gaussian(of, sigma, "constant")
         for of in (surface.astype(np.float64), known.astype(np.float64), np.where(known, values, 0.0))
     )
     return np.asarray(total / np.maximum(np.maximum(share, _LEAST_SHARE * of_all), np.finfo(float).tiny))
@@ -177,6 +180,5 @@ def _mean_along(surface: BoolArray, known: BoolArray, values: FloatArray, sigma:
 def _mean_around(values: Float32Array, where: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     """Mean of the values (ni, nj, nk) of some voxels in the neighbourhood of each voxel; 0 if there are none."""
     sigma = _AROUND_MM / spacing_mm
-    share = gaussian_filter(where.astype(np.float32), sigma, truncate=_TRUNCATE)
-    total = gaussian_filter(np.where(where, values, 0.0), sigma, truncate=_TRUNCATE)
+    share, total = gaussian(where.astype(np.float32), sigma), gaussian(np.where(where, values, 0.0), sigma)
     return np.asarray(total / np.maximum(share, 1e-4))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dvc.arguments import check
-from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, different, frozen
 from dvc.errors import GeometryError, InputError, few
 from dvc.images.bone_names import is_bones_name
 
@@ -306,7 +306,7 @@ class LabelMap:
         if given.dtype.kind == "f" and not (given == np.rint(given)).all():
             raise InputError("Labels must be whole numbers. Resample label maps only by nearest neighbour.")
         object.__setattr__(self, "labels", _on(self.grid, "The label map", self.labels, np.int64))
-        present = np.unique(self.labels).tolist()
+        present = different(self.labels)[0].tolist()
         if present and present[0] < 0:
             raise InputError(f"Labels must not be negative; found {present[0]}.")
         if nameless := [v for v in present if v != 0 and v not in self.names]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import BoolArray, FloatArray, frozen
+from dvc.arrays import BoolArray, FloatArray, different, frozen
 from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
 from dvc.images.bone_names import is_bones_name
@@ -143,7 +143,7 @@ def bones_of(labels: LabelMap, given: Sequence[str] = ()) -> tuple[str, ...]:
     """
     if given:
         return tuple(given)
-    there = set(np.unique(labels.labels).tolist())
+    there = set(different(labels.labels)[0].tolist())
     names = [name for number, name in labels.names.items() if number in there and is_bones_name(name)]
     if not names and any(name.startswith("label-") for name in labels.names.values()):
         return ("bone",)
