@@ -22,7 +22,7 @@ from fe import read_tet_mesh
 from mrstrain.records.provenance import versions
 
 SETS = ("friedman", "spears", "luboz", "trebbi", "zwam", "erdemir", "akrami")
-TOLD = ("reached", "seconds", "iterations", "plate_travel_mm", "plate_force_n", "nodes_on_plate",
+TOLD = ("reached", "seconds", "iterations", "plate_displacement_mm", "plate_force_n", "nodes_on_plate",
         "volume_share_with_patch_det_f_off_by_5_percent")  # fmt: skip
 
 

@@ -66,7 +66,7 @@ from phantoms import (
 )
 from validate import read_result
 
-ENGINES = ("gauss-newton-borders", "gauss-newton-bone", "gauss-newton")
+ENGINES = ("gauss-newton-borders", "gauss-newton-bone", "gauss-newton", "heel-mr")
 VOXEL_MM, SNR = (0.8, 0.8, 0.8), 25.0
 COARSE_MM = (1.2, 1.2, 1.2)
 NEAR_MM = 3.0

@@ -194,13 +194,13 @@ class Simulation:
     def __str__(self) -> str:
         lines = []
         for state in self.states:
-            shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
+            shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p95:.3f}" for row in self._rows(state))
             (push, pull, _), (moved, along, _) = state.force_n, state.plate_displacement_mm
             force = f"{push:.1f} N normal, {pull:z.1f} N shear"
             part = "" if state.reached == 1 else f" ONLY {100 * state.reached:.0f} % of the load was reached ({force});"
             lines.append(
                 f"{self.name}, {state.load.name}:{part} plate displacement {moved:z.2f} mm normal, {along:z.2f} mm "
-                f"shear; max. shear, median / 90th percentile: {shear}"
+                f"shear; max. shear, median / 95th percentile: {shear}"
             )
         return "\n".join([*lines, *(n if n.startswith(f"{self.name} ") else f"{self.name}: {n}" for n in self.notes)])
 
@@ -218,13 +218,13 @@ class Simulation:
         rows: list[tuple[str | float, ...]] = []
         for state in self.states:
             plate = (round(float(v), 2) for v in (*state.plate_displacement_mm[:2], *state.force_n[:2]))
-            shear = (f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
+            shear = (f"{row.shear_p50:.3f} / {row.shear_p95:.3f}" for row in self._rows(state))
             rows.append((state.load.name, str(state.load), f"{100 * state.reached:.0f} %", *plate, *shear))
         head = (
             "load", "target", "reached", "normal displacement, mm", "shear displacement, mm", "normal force, N",
             "shear force, N",
         )  # fmt: skip
-        title = "Plate displacement and force; maximum shear strain of each tissue, median / 90th percentile"
+        title = "Plate displacement and force; maximum shear strain of each tissue, median / 95th percentile"
         table = Table(title, (*head, *self.materials.materials), tuple(rows))
         picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
         ended = f"{sum(state.reached == 1.0 for state in self.states)} of {len(self.loads)} loads reached"
@@ -312,7 +312,7 @@ class Simulation:
             "out_of_time": state.out_of_time,
             "stable_share": min(row.stable_share for row in self._rows(state)),
             "plate_axes_lps": state.plate_axes.tolist(),
-            **{f"plate_{key}": getattr(plate, vector).tolist() for vector, key in result.PLATE_VECTORS.items()},
+            **{f"plate_{vector}": getattr(plate, vector).tolist() for vector in result.PLATE_VECTORS},
             "contact_area_mm2": plate.area_mm2,
             "contact_pressure_mpa": plate.pressure_mpa if plate.area_mm2 > 0.0 else None,
             "nodes_on_plate": len(state.on_plate),

@@ -67,7 +67,7 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     skin, states = np.unique(mesh.facets[SKIN]), []
     for name, at in outcome.items():  # no file: the time limit was reached before the first equilibrium
         _, u_mm, gradients, pressure_mpa = files.get(name, undeformed)
-        vectors = {vector: np.array(at[f"plate_{key}"]) for vector, key in PLATE_VECTORS.items()}
+        vectors = {vector: np.array(at[f"plate_{vector}"]) for vector in PLATE_VECTORS}
         plate, axes = PlateState(**vectors, area_mm2=at["contact_area_mm2"]), np.array(at["plate_axes_lps"])
         # The nodes on the plate are those of the skin that lie furthest along its normal.
         towards = axes @ Rotation.from_rotvec(plate.turn_deg, degrees=True).as_matrix()[:, 0]

@@ -136,9 +136,9 @@ def _drive_set(
         outcome[load] = {"reached": state.reached, "iterations": state.iterations, "seconds": round(state.seconds, 1)}
         own = fe.region_figures(mesh, state, laws)
         rows += own
-        figures = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in own)
+        figures = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p95:.3f}" for r in own)
         part = "" if state.reached == 1.0 else f" ONLY {100 * state.reached:.0f} % of the displacement was reached;"
-        lines.append(f"{name}, {load}:{part} max. shear, median / 90th percentile: {figures}")
+        lines.append(f"{name}, {load}:{part} max. shear, median / 95th percentile: {figures}")
     fe.write_regions_csv(folder / REGIONS, rows)
     write_whole(folder / SETTINGS, IN_IMAGE)
     write_whole(folder / "log.txt", "\n".join(log) + "\n")

@@ -40,7 +40,7 @@ from mrstrain.studies.true_error import error_against_truth
 from validate.best_model import without_banner
 
 _BY_A_PERSON = {"acquisition", "credibility"}  # tables of the study file with free text
-_OF_A_LOAD = "max. shear, median / 90th percentile:"  # in a line of numbers, which a table or picture shows, too
+_OF_A_LOAD = "max. shear, median / 95th percentile:"  # in a line of numbers, which a table or picture shows, too
 _RELOAD_S = 10  # a browser shows the page anew, while a study runs
 
 

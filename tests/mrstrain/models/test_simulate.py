@@ -87,7 +87,7 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         assert {row["load"] for row in drawn} == {"Load1", "Load2", "Load3"}
         for axis in ("normal", "shear"):
             for there, here in (
-                (f"{axis}_displacement_mm", f"travel_{axis}_mm"),
+                (f"{axis}_displacement_mm", f"displacement_{axis}_mm"),
                 (f"{axis}_force_n", f"force_{axis}_n"),
             ):
                 kept = [float(row[here]) for row in steps]
@@ -138,7 +138,7 @@ def test_a_plate_that_turns_says_so(mesh_file: Path, tmp_path: Path) -> None:
     assert told["parameters"]["pivot_mm"] == [0.0, 12.0, 10.0]
     assert "free to rotate" in told["parameters"]["plate"]
     b = told["outcome"]["b"]
-    assert b["plate_travel_mm"][1] == pytest.approx(0.5)
+    assert b["plate_displacement_mm"][1] == pytest.approx(0.5)
     assert abs(b["plate_turn_deg"][2]) > 0.5
     assert np.abs(b["plate_moment_nmm"]).max() < 1e-2
 
@@ -250,9 +250,9 @@ def test_meshes_of_ansys_and_abaqus_give_what_the_same_mesh_gives_as_vtu(
         assert done.exit_code == 0, done.output
         told[out.name] = json.loads((out / "luboz" / "simulation.json").read_text())["outcome"]["a"]
     for name in ("cdb", "inp"):
-        assert told[name]["plate_travel_mm"] == pytest.approx(told["vtu"]["plate_travel_mm"], abs=1e-7)
+        assert told[name]["plate_displacement_mm"] == pytest.approx(told["vtu"]["plate_displacement_mm"], abs=1e-7)
         assert told[name]["nodes_on_plate"] == told["vtu"]["nodes_on_plate"]
-    assert told["vtu"]["plate_travel_mm"][0] > 0.5
+    assert told["vtu"]["plate_displacement_mm"][0] > 0.5
 
 
 @pytest.mark.parametrize(

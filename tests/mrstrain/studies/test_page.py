@@ -134,7 +134,7 @@ def test_the_table_of_stages_repeats_neither_reasons_nor_what_sections_tell(stud
 
 
 def test_the_table_of_stages_has_the_headline_and_the_notes_of_a_simulation(study: Study) -> None:
-    of_load = "trebbi, Load1: plate displacement 10.30 mm; max. shear, median / 90th percentile: fat 0.131 / 0.425"
+    of_load = "trebbi, Load1: plate displacement 10.30 mm; max. shear, median / 95th percentile: fat 0.131 / 0.425"
     note = "trebbi: Load1: the material of fat is not stable (Drucker) in 2.0 % of its volume."
     simulated = StageResult((of_load, note), headline="plate displacement, mm: Load1 10.3")
     page = page_of(study, ended(study, simulate_trebbi=simulated))
