@@ -46,7 +46,7 @@ def main() -> None:
     command += ["--limit-minutes", str(given.limit_minutes)]
     spent = timed(HERE, *command)
     results = {
-        "command": shlex.join(["mrstrain", *command]),
+        "command": shlex.join(["mrstrain", "simulate", given.mesh.name, "--out", work.name, *command[4:]]),
         "versions": versions(),
         "cores": len(os.sched_getaffinity(0)),
         "cells": len(read_tet_mesh(given.mesh).cells),
