@@ -108,6 +108,12 @@ class Worker(AbstractContextManager["Worker", None]):
             for module in modules:
                 self._submitted(self._running(), _imported, module)
 
+    def beforehand(self, task: Callable[[], None]) -> None:
+        """Let the child do a task before the next one; nobody waits for it, or learns how it ends."""
+        if not _here:
+            with self._lock:
+                self._submitted(self._running(), task)
+
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
         """Run ``task(*args)`` in the child; its exceptions are raised here, and `WorkerError` if the child dies.
 

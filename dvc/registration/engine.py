@@ -197,6 +197,10 @@ class Engine(Protocol):
         """Prepare the first run on a machine (compilation); done in parallel with the rigid alignment."""
         return
 
+    def prepare_beside(self) -> None:
+        """Prepare a part of the same in the process of the alignment, once that is done."""
+        return
+
     def record(self) -> dict[str, object]:
         """Its parameters as plain values, for provenance."""
 

@@ -210,6 +210,7 @@ def register(
         noise = beside.submit(noise_of, reference, loaded, body)
         doubt = beside.submit(mask_doubt, reference, bone, body) if bone and chosen.align_on == "bone" else None
         alignment = _alignment(fixed, moving, within, rigid, chosen, runner)
+        runner.beforehand(engine.prepare_beside)
         pair = AlignedPair.of(fixed, moving, alignment.motion, within, rigid, tissues)
         tell("aligning", 1.0)
         of_noise = noise.result()  # known before the alignment, as a rule

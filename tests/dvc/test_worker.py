@@ -390,3 +390,9 @@ def test_a_process_that_keeps_memory_is_kept_for_the_next_task():
         time.sleep(1.5)
         assert worker.run("holding memory", holding, 600) == first
         assert worker.run("holding memory", holding, 1) == first
+
+
+def test_what_nobody_waits_for_is_done_before_the_next_task_and_may_fail() -> None:
+    with Worker(1) as worker:
+        worker.beforehand(_fails)
+        assert worker.run("telling", os.getpid) != os.getpid()

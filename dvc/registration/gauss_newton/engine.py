@@ -16,7 +16,7 @@ from dvc.errors import ParameterError
 from dvc.images.tissue import bright_voxels
 from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Found, Progress
 from dvc.registration.gauss_newton.choice import Choice
-from dvc.registration.gauss_newton.first_run import compile_loops
+from dvc.registration.gauss_newton.first_run import compile_beside, compile_loops
 from dvc.registration.gauss_newton.fit import Parameters, fit
 from dvc.registration.gauss_newton.with_interfaces import (
     NO_RIM,
@@ -120,6 +120,10 @@ class GaussNewton(Parameters, Engine):
         """Compile the loops, if no run has done so before."""
         compile_loops(lambda pair: fit(pair, self))
 
+    def prepare_beside(self) -> None:
+        """Compile a part of them, if no run has done so before."""
+        compile_beside()
+
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
     ) -> Found:
@@ -198,6 +202,10 @@ class GaussNewtonWithInterfaces(Engine):
     def prepare(self) -> None:
         """Compile the loops, if no run has done so before."""
         compile_loops(lambda pair: fit_with_interfaces(pair, self.smooth))
+
+    def prepare_beside(self) -> None:
+        """Compile a part of them, if no run has done so before."""
+        compile_beside()
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
@@ -288,6 +296,10 @@ class GaussNewtonAtBone(Engine):
     def prepare(self) -> None:
         """Compile the loops, if no run has done so before."""
         compile_loops(lambda pair: fit_with_interfaces(replace(pair, labels=None), self.smooth))
+
+    def prepare_beside(self) -> None:
+        """Compile a part of them, if no run has done so before."""
+        compile_beside()
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress

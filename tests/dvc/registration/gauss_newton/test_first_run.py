@@ -45,16 +45,42 @@ def test_a_fit_compiles_nothing_more(engine: str, labels: str, tmp_path) -> None
     assert run.stdout.strip() == "[]", run.stdout
 
 
+COMPILED = """
+from numba.core import event
+import dvc
+with event.install_recorder("numba:compile") as compiled:
+    dvc.{}().{}()
+functions = [e.data["dispatcher"].py_func for _, e in compiled.buffer]
+print(*(f.__name__ for f in functions if f.__module__.startswith("dvc.")))
+"""
+
+
+@pytest.mark.full_size
+@pytest.mark.parametrize("engine", ["GaussNewtonWithInterfaces", "GaussNewtonAtBone", "GaussNewton"])
+def test_two_processes_compile_different_loops(engine: str, tmp_path) -> None:
+    there = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    beside, rest = (
+        set(subprocess.run([sys.executable, "-c", script], env=there, capture_output=True, text=True, check=True)
+            .stdout.split())
+        for script in (COMPILED.format(engine, part) for part in ("prepare_beside", "prepare"))
+    )  # fmt: skip
+    assert {"_carry", "_normal", "_strain", "_depths_at_voxels"} <= beside
+    assert "sweep" in rest - beside
+    assert beside & rest <= {"summed_spline"}  # which takes arguments of another kind there
+
+
+@pytest.mark.parametrize("beside", [False, True])
 @pytest.mark.parametrize("engine", [GaussNewton(), GaussNewtonAtBone(), GaussNewtonWithInterfaces()])
-def test_nothing_is_done_where_an_earlier_run_has_stored_its_loops(engine, monkeypatch) -> None:
+def test_nothing_is_done_where_an_earlier_run_has_stored_its_loops(engine, beside, monkeypatch) -> None:
     fitted = []
     monkeypatch.setattr(first_run, "_tiny_pair", lambda: fitted.append("pair"))
     monkeypatch.setattr(first_run, "stored", lambda: True)
-    engine.prepare()
+    prepare = engine.prepare_beside if beside else engine.prepare
+    prepare()
     assert not fitted
     monkeypatch.setattr(first_run, "stored", lambda: False)
     with pytest.raises((AttributeError, TypeError)):  # there is no pair to fit
-        engine.prepare()
+        prepare()
     assert fitted
 
 
