@@ -1,4 +1,4 @@
-"""Time of the seven published material sets under the four loads on one mesh, as `mrstrain simulate` runs them.
+"""Time of the published material sets under the four loads on one mesh, as `mrstrain simulate` runs them.
 
     .venv/bin/python -m benchmarks.published_sets heel.vtu --work /tmp/sets --out benchmarks/results/published_sets.json
 

@@ -66,7 +66,7 @@ from phantoms import (
 )
 from validate import read_result
 
-ENGINES = ("gauss-newton-borders", "gauss-newton-bone", "gauss-newton", "heel-mr")
+ENGINES = ("gauss-newton-borders", "gauss-newton-bone", "gauss-newton")
 VOXEL_MM, SNR = (0.8, 0.8, 0.8), 25.0
 COARSE_MM = (1.2, 1.2, 1.2)
 NEAR_MM = 3.0
@@ -283,7 +283,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--heels", type=int, nargs="+", help="only make the pairs of these heels")
     with_bars = [engine for engine in ENGINES if error_model_of(engine) is not None]
-    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=with_bars)
+    parser.add_argument("--engines", nargs="+", choices=(*ENGINES, "heel-mr"), default=with_bars)
     parser.add_argument("--untouched", action="store_true", help="the motions that no error model may see")
     parser.add_argument("--out", type=Path, help="results of other engines in this file are kept")
     parser.add_argument("--widen", type=Path, help="folder of an accuracy study")

@@ -37,19 +37,25 @@ def frozen(values: npt.ArrayLike, dtype: type[_T]) -> npt.NDArray[_T]:
     return array
 
 
-def different(values: IntArray) -> tuple[IntArray, IntArray]:
-    """The different whole numbers in an array, ascending, and the place of each value among them.
+def different(values: IntArray) -> IntArray:
+    """The different whole numbers in an array, ascending.
 
     As `numpy.unique`, which sorts; counting takes a tenth of the time where they lie close together, as labels do.
     """
-    if not values.size:
-        return np.empty(0, dtype=np.int64), np.empty(values.shape, dtype=np.int64)
-    least, greatest = int(values.min()), int(values.max())
+    if not values.size or values.min() < 0 or values.max() >= max(values.size, _FEW):
+        return np.unique(values)
+    return np.flatnonzero(np.bincount(values.ravel()))
+
+
+def different_and_places(values: IntArray) -> tuple[IntArray, IntArray]:
+    """The different whole numbers in an array, ascending, and the place of each value among them; as `different`."""
+    least, greatest = (int(values.min()), int(values.max())) if values.size else (0, _FEW)
     if greatest - least >= max(values.size, _FEW):
         found, places = np.unique(values, return_inverse=True)
         return found, places.reshape(values.shape)
-    there = np.bincount((values - least).ravel()) > 0
-    return least + np.flatnonzero(there), (np.cumsum(there) - 1)[values - least]
+    above = values - least
+    there = np.bincount(above.ravel()) > 0
+    return least + np.flatnonzero(there), (np.cumsum(there) - 1)[above]
 
 
 def numbers(words: Sequence[str]) -> FloatArray:

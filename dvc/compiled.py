@@ -52,8 +52,15 @@ class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]  # numba carries n
         return [vars(store)["_source_stamp"] for store in stores if store is not None]
 
     def save(self, key: Any, data: Any) -> None:
+        """Store code with its key: two processes that store at once may give two keys the same file."""
         with suppress(OSError):  # a full disk
-            super().save(key, data)
+            super().save(key, (key, data))
+
+    def load(self, key: Any) -> Any:
+        match super().load(key):
+            case (stored, data) if stored == key:
+                return data
+        return None
 
     def _dump(self, content: Any) -> bytes:
         dumped: bytes = super()._dump(content)

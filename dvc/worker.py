@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as FutureTimeout, wait
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -111,8 +111,8 @@ class Worker(AbstractContextManager["Worker", None]):
     def beforehand(self, task: Callable[[], None]) -> None:
         """Let the child do a task before the next one; nobody waits for it, or learns how it ends."""
         if not _here:
-            with self._lock:
-                self._submitted(self._running(), task)
+            with self._lock, suppress(Exception):  # of which the next task tells
+                self._submitted(self._running(), _then_hand_back, task)
 
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
         """Run ``task(*args)`` in the child; its exceptions are raised here, and `WorkerError` if the child dies.

@@ -23,6 +23,8 @@ _SHARES = (0.5, 0.9, 0.95, 0.99)
 _FAR = 0.05  # difference of det F between a patch and the constitutive model, above which the volume is counted
 PLATE_VECTORS = ("displacement_mm", "force_n", "turn_deg", "moment_nmm")
 """Vectors of a plate's state."""
+BEFORE = "travel", "displacement"
+"""What the first was called in older files, and is called now."""
 _COLUMNS = {
     vector: [vector.replace("_", f"_{axis}_") for axis in ("normal", "shear", "third")] for vector in PLATE_VECTORS
 }
@@ -202,6 +204,7 @@ def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
     """
     curves: dict[str, list[PlateState]] = {}
     for row in read_rows(path):
+        row |= {name.replace(*BEFORE): value for name, value in row.items()}
         vectors = {vector: np.array([float(row[c]) for c in columns]) for vector, columns in _COLUMNS.items()}
         plate = PlateState(**vectors, area_mm2=float(row["contact_area_mm2"]))
         curves.setdefault(row["load"], []).append(plate)

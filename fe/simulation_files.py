@@ -22,7 +22,7 @@ from fe.mesh_file import BONE, SKIN
 from fe.plate import ContactStatus
 from fe.problem import LoadStep, Problem
 from fe.published import MaterialSet
-from fe.result import PLATE_VECTORS, read_curve_csv, read_state
+from fe.result import BEFORE, PLATE_VECTORS, read_curve_csv, read_state
 from fe.solution import LoadState
 
 RECORD = "simulation.json"
@@ -67,6 +67,7 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     skin, states = np.unique(mesh.facets[SKIN]), []
     for name, at in outcome.items():  # no file: the time limit was reached before the first equilibrium
         _, u_mm, gradients, pressure_mpa = files.get(name, undeformed)
+        at |= {name.replace(*BEFORE): value for name, value in at.items()}
         vectors = {vector: np.array(at[f"plate_{vector}"]) for vector in PLATE_VECTORS}
         plate, axes = PlateState(**vectors, area_mm2=at["contact_area_mm2"]), np.array(at["plate_axes_lps"])
         # The nodes on the plate are those of the skin that lie furthest along its normal.

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from dvc import threads
-from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, different, frozen
+from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, different_and_places, frozen
 from dvc.compiled import njit
 from dvc.deformation.bspline import ALIGNED_INDEX, BSpline, indices_along_axes, summed_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
@@ -73,7 +73,7 @@ class Interfaces:
         if not values.all():
             to = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
             values = values[tuple(to)]
-        tissues, own = different(values)
+        tissues, own = different_and_places(values)
         rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
         return cls.between(labels.grid, frozen(own, np.int64), rest, float(reach_mm))
 

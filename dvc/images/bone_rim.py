@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.images.depth import depth_mm
-from dvc.images.filters import gaussian
+from dvc.images.filters import TRUNCATE, gaussian
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import within
@@ -17,7 +17,6 @@ from dvc.images.tissue import within
 _REACH = 2.5  # voxels, of a surface that is moved
 _BLUR_MM = 0.4
 _AROUND_MM = 3.0  # standard deviation of the neighbourhood whose brightness is compared with that of a rim
-_TRUNCATE = 4.0  # standard deviations at which a Gaussian ends
 _DARK_PERCENT = 5.0  # of the voxels near a surface of bone: as dark as its rim
 _EDGE = 0.4  # of the step from rim to soft tissue: the rim's darkest voxels still show some of what is beside it
 _RIM_MM = 1.2  # of a rim beyond its darkest part, at most, where voxels are smaller
@@ -70,7 +69,7 @@ def bone_to_rim(image: Image, bone: Mask, body: Mask, *, dark: BoolArray | None 
     if is_thick and dark is None:
         return bone, 0.0
     reach_mm, edge_mm = reach_of(spacing), float(spacing.mean())
-    box = bone.box(int(np.ceil((reach_mm + _TRUNCATE * _AROUND_MM) / spacing.min())))
+    box = bone.box(int(np.ceil((reach_mm + TRUNCATE * _AROUND_MM) / spacing.min())))
     part, given = fill_missing(Image(image.grid.part(box), image.values[box])), bone.inside[box]
     rims = _Rims.of(part.values, given, body.inside[box] & ~given, spacing)
     clear_mm = np.full(given.shape, np.inf)

@@ -20,7 +20,8 @@ _Values = npt.NDArray[Any]
 _Filter = Callable[[_Values, int, _Values], object]  # of values along an axis, into another array
 
 _SLAB = 8  # lines of the second axis that are copied together
-_TRUNCATE = 4.0  # standard deviations
+TRUNCATE = 4.0
+"""Standard deviations at which a Gaussian ends."""
 _BEYOND = {"nearest": "edge", "reflect": "symmetric", "wrap": "wrap"}  # scipy's names of modes, and NumPy's
 
 
@@ -51,9 +52,9 @@ def _weights(width: float, order: int) -> Float32Array:
     """Those of scipy, (2 r + 1,), of the values from r places before to r places after."""
     if width <= 1e-15:
         return np.ones(1, np.float32)
-    reach = int(_TRUNCATE * width + 0.5)
+    reach = int(TRUNCATE * width + 0.5)
     impulse = np.eye(1, 2 * reach + 1, reach)[0]
-    answer = gaussian_filter1d(impulse, width, order=order, mode="constant", truncate=_TRUNCATE)
+    answer = gaussian_filter1d(impulse, width, order=order, mode="constant", truncate=TRUNCATE)
     return np.ascontiguousarray(answer[::-1], np.float32)
 
 

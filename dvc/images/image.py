@@ -306,7 +306,7 @@ class LabelMap:
         if given.dtype.kind == "f" and not (given == np.rint(given)).all():
             raise InputError("Labels must be whole numbers. Resample label maps only by nearest neighbour.")
         object.__setattr__(self, "labels", _on(self.grid, "The label map", self.labels, np.int64))
-        present = different(self.labels)[0].tolist()
+        present = different(self.labels).tolist()
         if present and present[0] < 0:
             raise InputError(f"Labels must not be negative; found {present[0]}.")
         if nameless := [v for v in present if v != 0 and v not in self.names]:

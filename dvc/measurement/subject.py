@@ -143,7 +143,7 @@ def bones_of(labels: LabelMap, given: Sequence[str] = ()) -> tuple[str, ...]:
     """
     if given:
         return tuple(given)
-    there = set(different(labels.labels)[0].tolist())
+    there = set(different(labels.labels).tolist())
     names = [name for number, name in labels.names.items() if number in there and is_bones_name(name)]
     if not names and any(name.startswith("label-") for name in labels.names.values()):
         return ("bone",)

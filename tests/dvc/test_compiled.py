@@ -60,6 +60,15 @@ def test_a_damaged_one_is_compiled_again(module, ending, left, damage):
         assert {path: path.read_bytes() for path in others} == others
 
 
+def test_code_for_other_arguments_is_not_taken(module):
+    """Of two processes that store at once, one may name a file in the index, and the other write it."""
+    assert hits(module) == 0
+    one, other = files(module, "nbc")
+    other.write_bytes(one.read_bytes())
+    assert hits(module) == 1
+    assert hits(module) == 2
+
+
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
     """Three files whose functions call one another; imports the outermost as another process would."""

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import numpy as np
 import psutil
@@ -392,7 +393,8 @@ def test_a_process_that_keeps_memory_is_kept_for_the_next_task():
         assert worker.run("holding memory", holding, 1) == first
 
 
-def test_what_nobody_waits_for_is_done_before_the_next_task_and_may_fail() -> None:
+def test_what_nobody_waits_for_is_done_before_the_next_task_and_may_fail(tmp_path) -> None:
     with Worker(1) as worker:
         worker.beforehand(_fails)
-        assert worker.run("telling", os.getpid) != os.getpid()
+        worker.beforehand(partial(os.mkdir, tmp_path / "made"))
+        assert worker.run("looking", (tmp_path / "made").is_dir)

@@ -95,6 +95,19 @@ def test_what_is_odd_is_told_before_anything_is_solved_and_noted() -> None:
     assert done.notes[:2] == tuple(heard.lines[:2])
 
 
+def test_names_of_older_files_are_known(simulation: fe.Simulation, tmp_path: Path) -> None:
+    simulation.write(tmp_path)
+    for file, now, before in (
+        ("simulation.json", "plate_displacement_mm", "plate_travel_mm"), ("curve.csv", "displacement_", "travel_"),
+    ):  # fmt: skip
+        text = (tmp_path / file).read_text()
+        assert now in text
+        (tmp_path / file).write_text(text.replace(now, before))
+    for was, state in zip(simulation.states, fe.Simulation.read(tmp_path).states, strict=True):
+        assert state.plate_displacement_mm.tolist() == was.plate_displacement_mm.tolist()
+        assert state.curve[1].displacement_mm == pytest.approx(was.curve[1].displacement_mm, rel=1e-7, abs=1e-7)
+
+
 def test_what_was_not_reached_comes_back_and_is_marked_everywhere(unreached: fe.Simulation, tmp_path: Path) -> None:
     share = unreached.state("far & too much").reached
     assert 0.0 < share < 1.0

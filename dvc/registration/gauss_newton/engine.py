@@ -122,7 +122,7 @@ class GaussNewton(Parameters, Engine):
 
     def prepare_beside(self) -> None:
         """Compile a part of them, if no run has done so before."""
-        compile_beside()
+        compile_beside(interfaces=False)
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
@@ -205,7 +205,7 @@ class GaussNewtonWithInterfaces(Engine):
 
     def prepare_beside(self) -> None:
         """Compile a part of them, if no run has done so before."""
-        compile_beside()
+        compile_beside(interfaces=True)
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
@@ -299,7 +299,7 @@ class GaussNewtonAtBone(Engine):
 
     def prepare_beside(self) -> None:
         """Compile a part of them, if no run has done so before."""
-        compile_beside()
+        compile_beside(interfaces=True)
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress

@@ -31,19 +31,22 @@ def compile_loops(fitting: Callable[[AlignedPair], tuple[Deformation, object]]) 
     _strained(pair, found)
 
 
-def compile_beside() -> None:
-    """Compile and store the loops that a fit needs beside the largest one, which another process compiles meanwhile."""
+def compile_beside(*, interfaces: bool) -> None:
+    """Compile and store the loops that a fit needs beside the largest one, which another process compiles meanwhile.
+
+    With ``interfaces``, also those of a displacement whose gradient jumps there.
+    """
     if stored():
         return
     pair = _tiny_pair()
-    assert pair.labels is not None
     control = control_grid(pair.fixed.grid, np.full(3, _CONTROL_MM))
     still = np.zeros((3, *control.shape))
     images = ImagePair(pair.fixed, pair.moving, pair.compared.inside, control, np.ones(3, dtype=np.int64))
     images.normal(still, np.broadcast_to(np.eye(3), (*pair.fixed.grid.shape, 3, 3)).copy())
     v = BSpline(control, still)
-    for found in (v, InterfaceSpline(v, v, Interfaces.of(pair.labels, pair.bone, _CONTROL_MM, pair.body))):
-        _strained(pair, found)
+    _strained(pair, v)
+    if interfaces and pair.labels is not None:
+        _strained(pair, InterfaceSpline(v, v, Interfaces.of(pair.labels, pair.bone, _CONTROL_MM, pair.body)))
 
 
 def _strained(pair: AlignedPair, found: Deformation) -> None:

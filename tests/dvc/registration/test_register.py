@@ -350,6 +350,18 @@ def test_progress_tells_stages_and_rises(tiny_pair, worker):
     assert len(fractions) > 2
 
 
+def test_the_worker_compiles_beside_the_caller_once_it_has_aligned(tiny_pair, worker, monkeypatch):
+    told = list[object]()
+    monkeypatch.setattr(worker, "beforehand", told.append)
+    run = worker.run
+    monkeypatch.setattr(worker, "run", lambda what, *given, **how: told.append(what) or run(what, *given, **how))
+    chosen = Settings(GaussNewton(bending=10.0, volume=300.0))
+    register(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.bone, settings=chosen, worker=worker)
+    aligning, beside, fitting = told
+    assert (aligning, beside) == ("aligning the bone", chosen.engine.prepare_beside)
+    assert isinstance(fitting, str)
+
+
 def test_the_motion_of_a_bone_is_taken_from_any_deformation(small_pair):
     motion = small_pair.foot_motion
     found = motion_of(Composed([small_pair.deformation, motion]), small_pair.bone)
