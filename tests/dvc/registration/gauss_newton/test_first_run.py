@@ -51,7 +51,7 @@ import dvc
 with event.install_recorder("numba:compile") as compiled:
     dvc.{}().{}()
 functions = [e.data["dispatcher"].py_func for _, e in compiled.buffer]
-print(*(f.__name__ for f in functions if f.__module__.startswith("dvc.")))
+print(*(f.__module__ + "." + f.__name__ for f in functions if f.__module__.startswith("dvc.")))
 """
 
 
@@ -64,9 +64,11 @@ def test_two_processes_compile_different_loops(engine: str, tmp_path) -> None:
             .stdout.split())
         for script in (COMPILED.format(engine, part) for part in ("prepare_beside", "prepare"))
     )  # fmt: skip
-    assert {"_carry", "_normal", "_strain", "_depths_at_voxels"} <= beside
-    assert "sweep" in rest - beside
-    assert beside & rest <= {"summed_spline"}  # which takes arguments of another kind there
+    fit, spline = "dvc.registration.gauss_newton", "dvc.deformation"
+    assert {f"{fit}.image_term._carry", f"{fit}.image_term._normal", f"{spline}.strain._strain"} <= beside
+    assert (f"{spline}.interface_spline._depths_at_voxels" in beside) == (engine != "GaussNewton")
+    assert f"{fit}.sweeps.sweep" in rest - beside
+    assert beside & rest <= {f"{spline}.bspline.summed_spline"}  # which takes arguments of another kind there
 
 
 @pytest.mark.parametrize("beside", [False, True])
