@@ -17,6 +17,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 
 _DIGEST = sha256().digest_size
+_FORMAT = "key and code"  # of a file: what was stored in another is damaged to this program, and to that one
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -68,8 +69,8 @@ class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]  # numba carries n
 
     @property
     def _salt(self) -> bytes:
-        """Makes a checksum one of these sources: a file of the same name may hold code from others."""
-        return repr(self._source_stamp).encode()
+        """Makes a checksum one of these sources: a file of that name may hold code from others, or without a key."""
+        return repr((_FORMAT, self._source_stamp)).encode()
 
     def _load_index(self) -> dict[Any, Any]:
         head = pickle.dumps(self._version, protocol=-1)
